@@ -25,7 +25,7 @@ from warpgs.captures.opening import load_capture, open_capture
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.taken import taken_frame
-from warpgs.evaluation import evaluate, evaluate_run
+from warpgs.evaluation import evaluate, evaluate_run, scene_metrics
 from warpgs.evaluation.evaluate import Evaluation, ViewMetrics
 from warpgs.evaluation.lpips import Lpips
 from warpgs.files import write_json
@@ -106,7 +106,7 @@ def test_psnr_is_the_mean_over_views_of_each_views_psnr():
     images = noisy(here)
     expected = [decibels(here, images, name) for name in VAL]
     result = evaluated(here, images)
-    assert [view.psnr for view in result.views] == pytest.approx(expected, abs=1e-3)
+    assert [view.values["psnr"] for view in result.views] == pytest.approx(expected, abs=1e-3)
     assert result.summary()["psnr"] == pytest.approx(sum(expected) / 3, abs=1e-3)
 
 
@@ -114,23 +114,29 @@ def test_static_and_dynamic_psnr_are_those_of_the_masks_regions():
     here = capture()
     images = noisy(here)
     for view in evaluated(here, images).views:
-        assert view.psnr_dynamic == pytest.approx(decibels(here, images, view.name, rows=slice(0, 4)), abs=1e-3)
-        assert view.psnr_static == pytest.approx(decibels(here, images, view.name, rows=slice(4, None)), abs=1e-3)
+        assert view.values["psnr_dynamic"] == pytest.approx(
+            decibels(here, images, view.name, rows=slice(0, 4)), abs=1e-3
+        )
+        assert view.values["psnr_static"] == pytest.approx(
+            decibels(here, images, view.name, rows=slice(4, None)), abs=1e-3
+        )
 
 
 def test_masked_psnr_is_that_of_the_covisible_pixels():
     here = capture(covisible=True)
     images = noisy(here)
     for view in evaluated(here, images).views:
-        assert view.masked_psnr == pytest.approx(decibels(here, images, view.name, columns=slice(0, 5)), abs=1e-3)
+        assert view.values["masked_psnr"] == pytest.approx(
+            decibels(here, images, view.name, columns=slice(0, 5)), abs=1e-3
+        )
 
 
 def test_masked_ssim_does_not_see_what_is_not_covisible():
     here = capture(covisible=True)
     images = noisy(here)
     spoilt = {time: torch.cat([image[:, :5], torch.rand(H, W - 5, 3)], 1) for time, image in images.items()}
-    wanted = [view.masked_ssim for view in evaluated(here, images).views]
-    assert [view.masked_ssim for view in evaluated(here, spoilt).views] == wanted
+    wanted = [view.values["masked_ssim"] for view in evaluated(here, images).views]
+    assert [view.values["masked_ssim"] for view in evaluated(here, spoilt).views] == wanted
 
 
 def test_values_outside_0_and_1_count_as_0_and_1():
@@ -145,24 +151,23 @@ def test_what_a_capture_does_not_have_is_not_measured():
     view = evaluated(capture(masks=False), noisy(capture())).views[0]
     regions = "psnr_static psnr_dynamic ssim_static ssim_dynamic masked_psnr masked_ssim masked_lpips"
     for name in (*regions.split(), "lpips", "ms_ssim"):
-        assert getattr(view, name) is None
+        assert view.values[name] is None
 
 
 def test_a_region_of_no_pixel_is_not_measured():
     here = capture()
     for name in VAL:
         here.frame(name).static_mask.fill_(True)
-    assert all(view.psnr_dynamic is None for view in evaluated(here, noisy(here)).views)
+    assert all(view.values["psnr_dynamic"] is None for view in evaluated(here, noisy(here)).views)
 
 
 def view_of(name, **values):
-    nothing = dict.fromkeys((f.name for f in dataclasses.fields(ViewMetrics)), None)
-    return ViewMetrics(**{**nothing, "name": name, "time": 0.0, "psnr": 20.0, "ssim": 0.5, **values})
+    return ViewMetrics(name, 0.0, {**dict.fromkeys(evaluate.of_views()), "psnr": 20.0, "ssim": 0.5, **values})
 
 
 def test_a_mean_leaves_out_views_that_were_not_measured():
     views = [view_of("a", psnr_static=10.0), view_of("b"), view_of("c", psnr_static=30.0)]
-    assert Evaluation(views, None, 1.0, None).summary()["psnr_static"] == 20.0
+    assert Evaluation(views, {}, None).summary()["psnr_static"] == 20.0
 
 
 def test_each_view_is_shown_once_in_order():
@@ -186,8 +191,8 @@ def test_lpips_is_measured_with_the_network_that_is_given():
     truth = here.frame("b").image.float() / 255
     assert result.lpips_net == "squeeze"
     error = (images[0.5].clamp(0, 1) - truth).abs()
-    assert result.views[1].lpips == pytest.approx((error.mean() / 2).item())
-    assert result.views[1].masked_lpips == pytest.approx((error[:, :5].mean() / 2).item())
+    assert result.views[1].values["lpips"] == pytest.approx((error.mean() / 2).item())
+    assert result.views[1].values["masked_lpips"] == pytest.approx((error[:, :5].mean() / 2).item())
 
 
 LENS = Lens(60, 44, (62.0, 58.0), (31.3, 20.6), (-0.14, 0.05, 0.0), (0.006, -0.004))
@@ -236,7 +241,7 @@ def test_frames_are_compared_as_they_were_taken_without_resampling_them():
     """What is left is the rounding to 8 bits (58.9 dB) and the interpolation of the rendering."""
     shown, options = [], {"quiet": True, "as_taken": True}
     result = evaluate.evaluate(pattern_scene(), distorted_capture(), on_view=lambda *v: shown.append(v), **options)
-    assert result.views[0].psnr > 52.0
+    assert result.views[0].values["psnr"] > 52.0
     assert result.summary()["frames"] == "as taken"
     _, _, truth, distorted = shown[0]
     assert torch.equal(truth, distorted_capture().read_taken("a").frame.image.float() / 255)
@@ -260,7 +265,10 @@ def test_a_frame_as_it_was_taken_is_rendered_from_the_aligned_camera():
 
     options = {"quiet": True, "as_taken": True}
     aligned = evaluate.evaluate(pattern_scene(), distorted_capture(), align=moved, **options)
-    assert aligned.views[0].psnr < evaluate.evaluate(pattern_scene(), distorted_capture(), **options).views[0].psnr - 10
+    assert (
+        aligned.views[0].values["psnr"]
+        < evaluate.evaluate(pattern_scene(), distorted_capture(), **options).views[0].values["psnr"] - 10
+    )
 
 
 def test_the_check_of_the_views_keeps_none_in_memory():
@@ -296,7 +304,7 @@ def gray(value):
 
 def test_flicker_is_the_mean_change_between_consecutive_times():
     images = {0.25: gray(0.2), 0.5: gray(0.5), 0.75: gray(0.4)}
-    assert evaluated(capture(), images).flicker == pytest.approx((0.3 + 0.1) / 2)
+    assert evaluated(capture(), images).scene["flicker"] == pytest.approx((0.3 + 0.1) / 2)
 
 
 def test_flicker_uses_only_the_middle_camera():
@@ -322,7 +330,7 @@ def test_flicker_omits_pixels_that_are_dynamic_at_either_time():
             alpha[:3], image[:3] = 1.0, 1.0
         return rendering(image, alpha)
 
-    assert evaluate.evaluate(Scene(render), capture(), quiet=True).flicker == 0.0
+    assert evaluate.evaluate(Scene(render), capture(), quiet=True).scene["flicker"] == 0.0
 
 
 @pytest.mark.parametrize("val", [("a",), ()])
@@ -330,14 +338,14 @@ def test_flicker_needs_two_times(val):
     here = capture(val)
     for camera in here.cameras.values():
         object.__setattr__(camera, "time", 0.25)
-    assert evaluated(here, {0.25: gray(0.5)}).flicker is None
+    assert evaluated(here, {0.25: gray(0.5)}).scene["flicker"] is None
 
 
 def test_flicker_is_not_measured_if_everything_is_dynamic():
     def render(camera, branches):
         return rendering(gray(camera.time), torch.ones(H, W))
 
-    assert evaluate.evaluate(Scene(render), capture(), quiet=True).flicker is None
+    assert evaluate.evaluate(Scene(render), capture(), quiet=True).scene["flicker"] is None
 
 
 def test_fps_counts_joint_images_after_one_warm_up_frame(monkeypatch):
@@ -347,8 +355,8 @@ def test_fps_counts_joint_images_after_one_warm_up_frame(monkeypatch):
         now[0] += 0.0 if branches else (100.0 if now[0] == 0.0 else 0.02)
         return rendering(gray(0.5))
 
-    monkeypatch.setattr(evaluate.time, "perf_counter", lambda: now[0])
-    assert evaluate.evaluate(Scene(render), capture(), quiet=True).fps == pytest.approx(50.0)
+    monkeypatch.setattr(scene_metrics.time, "perf_counter", lambda: now[0])
+    assert evaluate.evaluate(Scene(render), capture(), quiet=True).scene["fps"] == pytest.approx(50.0)
 
 
 def test_without_evaluation_frames_only_flicker_and_speed_are_measured():
@@ -360,7 +368,7 @@ def test_without_evaluation_frames_only_flicker_and_speed_are_measured():
 
 def test_each_view_is_a_line_with_empty_fields_for_unmeasured_metrics(tmp_path):
     views = [view_of("a,b", psnr_static=12.5), view_of("c")]
-    evaluate.write_views(tmp_path / "views.csv", Evaluation(views, None, 1.0, None))
+    evaluate.write_views(tmp_path / "views.csv", Evaluation(views, {}, None))
     with open(tmp_path / "views.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     found = [(row["name"], row["psnr"], row["psnr_static"]) for row in rows]

@@ -25,7 +25,7 @@ def measured(psnrs, **others):
 
 
 def column(table, key):
-    index = [metric.key for metric in table.metrics].index(key)
+    index = list(table.metrics).index(key)
     return [row.values[index] for row in table.rows]
 
 
@@ -56,7 +56,7 @@ def test_a_capture_on_which_nothing_finished_is_left_out():
 def test_units_and_sums():
     cells = measured({("a", "as"): [1.0]}, train_seconds=90.0, peak_bytes=2_500_000_000, num_static=40, num_dynamic=2)
     (table,) = make_tables(cells, {"a": "a"}, {})
-    found = {metric.key: value.mean for metric, value in zip(table.metrics, table.rows[0].values, strict=True)}
+    found = {name: value.mean for name, value in zip(table.metrics, table.rows[0].values, strict=True)}
     assert found == {"psnr": 1.0, "train_seconds": 1.5, "peak_bytes": 2.5, "num_gaussians": 42.0}
 
 

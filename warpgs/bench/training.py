@@ -15,7 +15,7 @@ from warpgs.cameras import Camera
 from warpgs.config import ModelConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture, Frame
-from warpgs.evaluation.evaluate import frame_rate
+from warpgs.evaluation.scene_metrics import frame_rate
 from warpgs.initialization.point_cloud import scene_box
 from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene

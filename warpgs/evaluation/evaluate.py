@@ -2,16 +2,13 @@
 
 import csv
 import io
-import math
 import statistics
-import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
@@ -20,25 +17,10 @@ from warpgs.data.capture import Capture, Frame, TakenFrame
 from warpgs.files import write_text
 from warpgs.rendering import Rendering
 
-from . import metrics
 from .distort import distort
 from .lpips import Lpips
-
-
-@runtime_checkable
-class Renderer(Protocol):
-    """What is evaluated: ``TrainedScene`` is one."""
-
-    @property
-    def device(self) -> torch.device:
-        """Device to render on."""
-
-    def render(self, camera: Camera, *, branches: bool = False) -> Rendering:
-        """Renders through a camera at the camera's time, with or without the static and the dynamic image."""
-
-    def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
-        """The joint image, as fast as possible."""
-
+from .metric import Comparison, Renderer, known
+from .metrics import METRICS
 
 OnView = Callable[[int, Frame, Tensor, Rendering], None]
 """Receives the index, frame, [H, W, 3] ground truth in [0, 1] and rendering of a view."""
@@ -46,37 +28,20 @@ OnView = Callable[[int, Frame, Tensor, Rendering], None]
 Frames = Literal["as taken", "undistorted"]
 """What renderings are compared with."""
 
-STATIC_ALPHA = 0.05
-"""A pixel counts as static for the flicker score where the dynamic image's alpha is lower than this in both frames."""
-
-FLICKER_FRAMES = 30
-TIMED_FRAMES = 30
-TIMED_SECONDS = 0.5
-"""Frames are timed in rounds of ``TIMED_FRAMES``, for at least ``TIMED_SECONDS`` [s]."""
-
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """Metrics of one view; None where they could not be measured.
+    """Metrics of one view.
 
-    Images are clamped to [0, 1] and not rounded to 8 bits. ``_static`` and ``_dynamic`` are over the pixels of that
-    region of the view's mask, ``masked_`` over the co-visible pixels of iPhone captures, as in DyCheck. MS-SSIM needs
-    images of at least 161 pixels a side.
+    Attributes:
+        name: Id of the view.
+        time: Its time in [0, 1].
+        values: Metrics by name; None where they could not be measured.
     """
 
     name: str
     time: float
-    psnr: float
-    ssim: float
-    ms_ssim: float | None
-    lpips: float | None
-    psnr_static: float | None
-    psnr_dynamic: float | None
-    ssim_static: float | None
-    ssim_dynamic: float | None
-    masked_psnr: float | None
-    masked_ssim: float | None
-    masked_lpips: float | None
+    values: dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -85,31 +50,30 @@ class Evaluation:
 
     Attributes:
         views: One entry per view.
-        flicker: Mean absolute change between consecutive renderings of the static region through the middle camera of
-            the evaluation, held fixed; None with fewer than two times. There is no ground truth of a fixed camera in a
-            capture of a moving one, so changes that are real (shadows) count too.
-        fps: Joint images per second, including everything that depends on time.
+        scene: Metrics of the scene by name; None where they could not be measured.
         lpips_net: Network of LPIPS; None when it was not measured.
         frames: Whether frames were compared as they were taken, or undistorted, and so resampled, before.
     """
 
     views: list[ViewMetrics]
-    flicker: float | None
-    fps: float
+    scene: dict[str, float | None]
     lpips_net: str | None
     frames: Frames = "as taken"
 
     def summary(self) -> dict[str, Any]:
-        """Means over the views that have a value; None where none has."""
-        means = {f.name: _mean([getattr(v, f.name) for v in self.views]) for f in fields(ViewMetrics)[2:]}
+        """Means over the views that have a value, None where none has; and the metrics of the scene."""
         return {
-            **means,
+            **{name: _mean([view.values[name] for view in self.views]) for name in of_views()},
             "lpips_net": self.lpips_net,
             "frames": self.frames,
             "num_views": len(self.views),
-            "flicker": self.flicker,
-            "fps": self.fps,
+            **self.scene,
         }
+
+
+def of_views() -> dict[str, Callable[[Comparison], float | None]]:
+    """The functions of metrics that are measured on each view."""
+    return {name: metric.of_view for name, metric in METRICS.items() if metric.of_view is not None}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -129,7 +93,7 @@ def evaluate(
 ) -> Evaluation:
     """Compares a scene with every evaluation frame of a capture.
 
-    Without evaluation frames only flicker and frames per second are measured, through the training cameras.
+    Without evaluation frames only metrics of the scene are measured, through the training cameras.
 
     Args:
         scene: The scene to render.
@@ -155,8 +119,9 @@ def evaluate(
             on_view(index, frame, truth, rendering)
     cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
     frames: Frames = "as taken" if as_taken or capture.read_taken is None else "undistorted"
-    net, fps = lpips.net if lpips else None, frame_rate(scene.play, cameras)
-    return Evaluation(views, _flicker(scene, cameras, quiet), fps, net, frames)
+    of_scene = {name: metric.of_scene for name, metric in METRICS.items() if metric.of_scene is not None}
+    values = {name: measure(scene, cameras, quiet) for name, measure in of_scene.items()}
+    return Evaluation(views, values, lpips.net if lpips else None, frames)
 
 
 def read_views(capture: Capture, as_taken: bool = False) -> Iterator[tuple[Frame, TakenFrame | None]]:
@@ -185,72 +150,22 @@ def _as_taken(scene: Renderer, taken: TakenFrame, camera: Camera) -> tuple[Frame
 
 
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:
-    def within(metric: Callable[..., float | Tensor], region: Bool[Tensor, "H W"] | None) -> float | None:
-        if region is None or not bool(region.any()):
-            return None
-        return _known(float(metric(image, truth, region.to(image.device))))
-
-    static, covisible = frame.static_mask, frame.covisible
-    dynamic = None if static is None else ~static
-    return ViewMetrics(
-        name=frame.name,
-        time=frame.camera.time,
-        psnr=metrics.psnr(image, truth),
-        ssim=metrics.ssim(image, truth),
-        ms_ssim=_known(metrics.ms_ssim(image, truth)),
-        lpips=None if lpips is None else float(lpips(image, truth)),
-        psnr_static=within(metrics.psnr, static),
-        psnr_dynamic=within(metrics.psnr, dynamic),
-        ssim_static=within(metrics.ssim, static),
-        ssim_dynamic=within(metrics.ssim, dynamic),
-        masked_psnr=within(metrics.psnr, covisible),
-        masked_ssim=within(metrics.masked_ssim, covisible),
-        masked_lpips=None if lpips is None else within(lpips.masked, covisible),
+    static, covisible = (
+        None if mask is None else mask.to(image.device) for mask in (frame.static_mask, frame.covisible)
     )
-
-
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-def _flicker(scene: Renderer, cameras: Sequence[Camera], quiet: bool) -> float | None:
-    middle, times = cameras[len(cameras) // 2], sorted({camera.time for camera in cameras})
-    changes = []
-    before: Rendering | None = None
-    for at in progress(times[:FLICKER_FRAMES], "flicker", quiet):
-        after = scene.render(replace(middle, time=at), branches=True)
-        if before is not None:
-            assert before.dynamic is not None
-            assert after.dynamic is not None
-            static = (before.dynamic.alpha < STATIC_ALPHA) & (after.dynamic.alpha < STATIC_ALPHA)
-            change = metrics.flicker(before.joint.image.clamp(0, 1), after.joint.image.clamp(0, 1), static)
-            changes += [] if math.isnan(change) else [change]
-        before = after
-    return _mean(changes)
-
-
-def frame_rate(play: Callable[[Camera], object], cameras: Sequence[Camera]) -> float:
-    """Frames per second of wall time, after one warm-up frame, cycling through the cameras."""
-    device = cameras[0].viewmat.device
-
-    def play_frames(count: int) -> None:
-        for k in range(count):
-            play(cameras[k % len(cameras)])
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-
-    play_frames(1)
-    start, rounds = time.perf_counter(), 0
-    while time.perf_counter() - start < TIMED_SECONDS:
-        play_frames(TIMED_FRAMES)
-        rounds += 1
-    return rounds * TIMED_FRAMES / (time.perf_counter() - start)
+    comparison = Comparison(image, truth, static, covisible, lpips)
+    return ViewMetrics(
+        frame.name, frame.camera.time, {k: known(measure(comparison)) for k, measure in of_views().items()}
+    )
 
 
 def write_views(path: Path, evaluation: Evaluation) -> None:
     """Writes one line per view as CSV; an empty field was not measured."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, [f.name for f in fields(ViewMetrics)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: "" if v is None else v for k, v in asdict(view).items()} for view in evaluation.views)
+    writer = csv.writer(text, lineterminator="\n")
+    names = list(of_views())
+    writer.writerow(["name", "time", *names])
+    for view in evaluation.views:
+        values = [view.values[name] for name in names]
+        writer.writerow([view.name, view.time, *("" if value is None else value for value in values)])
     write_text(path, text.getvalue())

@@ -21,7 +21,8 @@ from warpgs.visualize.images import comparison, to_bytes
 from .evaluate import Evaluation, OnView, evaluate, write_views
 from .lpips import find
 from .machine import commit, device_name
-from .metrics import MIN_MS_SSIM_SIDE
+from .metric import Line
+from .metrics import METRICS
 from .motion import jitter
 from .poses import alignment
 
@@ -118,32 +119,31 @@ def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool)
 
 
 def _summary(values: dict[str, Any]) -> str:
-    def show(name: str, digits: int, unit: str = "") -> str:
-        value = values[name]
-        return "not measured" if value is None else f"{value:.{digits}f}{unit}"
-
-    last_line = f"{values['num_static']:,} static and {values['num_dynamic']:,} dynamic Gaussians"
-    motion = f"flicker {show('flicker', 5)}, jitter {show('jitter', 3)}, {show('fps', 1, ' FPS')}"
-    if not values["num_views"]:
-        quality = "the capture has no evaluation frames: PSNR, SSIM and LPIPS not measured"
-        return f"{quality}\n{motion}\n{last_line}"
-    lpips = f"LPIPS ({values['lpips_net']}) {show('lpips', 4)}"
-    if values["lpips_net"] is None:
-        lpips = "LPIPS not measured: no weights (give their folder with --lpips or in WARPGS_LPIPS)"
-    similarity = f"SSIM {show('ssim', 4)}, MS-SSIM {show('ms_ssim', 4)}"
-    if values["ms_ssim"] is None:
-        similarity += f" (a side is below {MIN_MS_SSIM_SIDE} px)"
-    views = f"{values['num_views']} view{'s' * (values['num_views'] != 1)}"
-    lines = [
-        f"{views}: PSNR {show('psnr', 2, ' dB')}, {similarity}, {lpips}",
-        f"static region {show('psnr_static', 2, ' dB')}, dynamic region {show('psnr_dynamic', 2, ' dB')}, {motion}",
-        last_line,
+    num_views = values["num_views"]
+    heads: dict[Line, str] = {"views": f"{num_views} view{'s' * (num_views != 1)}: ", "co-visible": "co-visible: "}
+    lines = [head + told for line, head in heads.items() if (told := _told(line, values))]
+    if not num_views:
+        lines = ["the capture has no evaluation frames: PSNR, SSIM and LPIPS not measured"]
+    lines += [
+        _told("scene", values),
+        f"{values['num_static']:,} static and {values['num_dynamic']:,} dynamic Gaussians",
     ]
+    if values["lpips_net"] is not None:
+        lines.append(f"network of LPIPS: {values['lpips_net']}")
     if values["poses_aligned"]:
         lines.append("camera poses were corrected in training, so held-out cameras were aligned to the scene")
     if values["frames"] == "undistorted":
         lines.append("frames were undistorted, and so resampled; eval --as-taken compares them as they were taken")
-    if values["masked_psnr"] is not None:
-        masked = f"mPSNR {show('masked_psnr', 2, ' dB')}, mSSIM {show('masked_ssim', 4)}"
-        lines.insert(1, f"co-visible: {masked}, mLPIPS {show('masked_lpips', 4)}")
     return "\n".join(lines)
+
+
+def _told(line: Line, values: dict[str, Any]) -> str:
+    """The metrics of a line of the summary; empty where none was measured. Without views, those of the scene alone."""
+    told = {
+        name: metric
+        for name, metric in METRICS.items()
+        if metric.line == line and (metric.of_view is None or values["num_views"])
+    }
+    if all(values[name] is None for name in told):
+        return ""
+    return ", ".join(metric.told(values[name]) for name, metric in told.items())

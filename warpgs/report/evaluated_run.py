@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import SCALARS, Even
 
 from warpgs.config import TrainConfig
 from warpgs.errors import command
+from warpgs.evaluation.metrics import METRICS
 from warpgs.files import read_bounded, read_json, require_file
 from warpgs.runs.config_file import read_config
 
@@ -27,21 +28,6 @@ MAX_EVENTS = 1 << 30
 
 MAX_VALUE = 1e18
 """Maximum magnitude of their numbers."""
-
-HIGHER = {
-    "psnr",
-    "ssim",
-    "ms_ssim",
-    "psnr_static",
-    "psnr_dynamic",
-    "ssim_static",
-    "ssim_dynamic",
-    "masked_psnr",
-    "masked_ssim",
-    "fps",
-}
-LOWER = {"lpips", "masked_lpips", "flicker", "jitter", "train_seconds", "peak_bytes"}
-"""Metrics of which higher, or lower, values are better."""
 
 REQUIRED = ("name", "time", "psnr")
 """Required columns of views.csv; all others are metrics like psnr."""
@@ -127,7 +113,7 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     if any(isinstance(value, dict | list) for value in values.values()):
         raise ValueError(f"{path} is damaged: expected an object with numbers and strings")
     for name, value in values.items():
-        is_text = isinstance(value, str) and name in HIGHER | LOWER
+        is_text = isinstance(value, str) and name in METRICS
         if is_text or (isinstance(value, int | float) and not abs(value) <= MAX_VALUE):
             raise ValueError(f"{path} is damaged: {reprlib.repr(name)} cannot be {reprlib.repr(value)}")
     return values

@@ -6,35 +6,19 @@ from typing import Any
 
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
+from warpgs.evaluation.metrics import METRICS
 
 from .evaluated_run import EvaluatedRun
 
 TITLES = {
-    "psnr": "PSNR [dB]",
-    "ssim": "SSIM",
-    "ms_ssim": "MS-SSIM",
-    "lpips": "LPIPS",
-    "psnr_static": "PSNR, static region [dB]",
-    "psnr_dynamic": "PSNR, dynamic region [dB]",
-    "ssim_static": "SSIM, static region",
-    "ssim_dynamic": "SSIM, dynamic region",
-    "masked_psnr": "mPSNR, co-visible [dB]",
-    "masked_ssim": "mSSIM, co-visible",
-    "masked_lpips": "mLPIPS, co-visible",
-    "fps": "FPS",
     "device": "FPS measured on",
     "lpips_net": "LPIPS network",
     "num_views": "views",
     "poses_aligned": "held-out cameras aligned",
     "train_seconds": "training time [h:m:s]",
-    "peak_bytes": "peak memory",
-    "num_static": "static Gaussians",
-    "num_dynamic": "dynamic Gaussians",
-    "mask_trial_psnr_with": "trial with the masks, PSNR [dB]",
-    "mask_trial_psnr_without": "trial without the masks, PSNR [dB]",
     "mask_trial_seconds": "trial of the masks [h:m:s]",
 }
-"""Titles of metrics; others keep their names in metrics.json."""
+"""Headings of facts, and of metrics that reports show in another unit than sweeps."""
 
 UNRELATED = {"out", "resume", "preset", "lpips", "lpips_net", "as_taken"}
 """Settings that do not affect training."""
@@ -62,8 +46,13 @@ def _speed(metrics: dict[str, Any]) -> float | None:
     return done / seconds
 
 
+def heading(name: str) -> str:
+    """The heading of a value of metrics.json; its name if it has none."""
+    return TITLES.get(name) or (METRICS[name].heading if name in METRICS else name)
+
+
 def formatted(name: str, value: Any) -> str:
-    """A metric as text: times and sizes with units, numbers with their significant digits."""
+    """A value of metrics.json as text, with the digits of its metric."""
     if value is None:
         return "not measured"
     if isinstance(value, bool):
@@ -73,12 +62,9 @@ def formatted(name: str, value: Any) -> str:
     if name in ("train_seconds", "mask_trial_seconds"):
         minutes, seconds = divmod(round(value), 60)
         return f"{minutes // 60}:{minutes % 60:02}:{seconds:02}"
-    if name == "peak_bytes":
-        return f"{value / 1e9:.2f} GB"
-    if isinstance(value, int):
-        return f"{value:,}"
-    digits = 2 if "psnr" in name else 1 if name == "fps" else 5 if name == "flicker" else 4
-    return f"{value:.{digits}f}"
+    if name in METRICS:
+        return METRICS[name].number(value / METRICS[name].scale)
+    return f"{value:,}" if isinstance(value, int) else f"{value:.4f}"
 
 
 def config_rows(configs: Sequence[TrainConfig]) -> list[tuple[str, list[str]]]:

@@ -6,12 +6,13 @@ import statistics
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
+from warpgs.evaluation.metrics import METRICS
 from warpgs.visualize.images import ERROR_RANGE
 
 from .charts import Series, chart, color_of
-from .evaluated_run import HIGHER, LOWER, EvaluatedRun, groups
+from .evaluated_run import EvaluatedRun, groups
 from .image_strips import Strips
-from .metrics_table import TITLES, config_rows, summary_rows
+from .metrics_table import config_rows, formatted, heading, summary_rows
 
 CURVES = ("psnr/train", "loss/total")
 """Tags of the first charts."""
@@ -117,16 +118,16 @@ def _summary(runs: Sequence[EvaluatedRun]) -> str:
             f"<td{' class=best' if best is not None and value == best else ''}>{text(formatted)}</td>"
             for value, formatted in zip(values, texts, strict=True)
         )
-        rows.append(f"<tr><th>{text(TITLES.get(name, name))}</th>{cells}</tr>")
+        rows.append(f"<tr><th>{text(heading(name))}</th>{cells}</tr>")
     note = "" if are_comparable else "<p class=note>The runs were evaluated on different captures or views.</p>"
     return f"<h2>Metrics and timing</h2>{note}{wide(_header(runs) + ''.join(rows))}"
 
 
 def _best(name: str, values: Iterable[Any]) -> float | None:
     known = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
-    if len(known) < 2 or name not in HIGHER | LOWER:
+    if len(known) < 2 or name not in METRICS or not METRICS[name].better:
         return None
-    return max(known) if name in HIGHER else min(known)
+    return max(known) if METRICS[name].better == "higher" else min(known)
 
 
 def _charts(runs: Sequence[EvaluatedRun]) -> str:
@@ -139,8 +140,9 @@ def _charts(runs: Sequence[EvaluatedRun]) -> str:
     without_events = [run.label for run in runs if not run.curves]
     note = f"<p class=note>Without TensorBoard events: {text(', '.join(without_events))}</p>" if without_events else ""
     by_view = [
-        chart(f"{TITLES[name]} of each view", "time", [_over_time(k, r, name) for k, r in enumerate(runs)], dots=True)
-        for name in ("psnr", "ssim", "lpips")
+        chart(f"{heading(name)} of each view", "time", [_over_time(k, r, name) for k, r in enumerate(runs)], dots=True)
+        for name, metric in METRICS.items()
+        if metric.of_view is not None and metric.line == "views"
     ]
     legend = " ".join(_named(runs, k) for k in range(len(runs)))
     return f'<h2>Curves</h2><p>{legend}</p>{note}<div class="charts">{"".join(by_tag)}{"".join(by_view)}</div>'
@@ -200,10 +202,13 @@ def _views(runs: Sequence[EvaluatedRun]) -> str:
     parts = ["<h2>All views</h2>"]
     for index, run in enumerate(runs):
         names = dict.fromkeys(name for view in run.views for name, v in view.metrics.items() if v is not None)
-        head = "".join(f"<th>{text(TITLES.get(name, name))}</th>" for name in ("view", "time", *names))
+        head = "".join(f"<th>{text(heading(name))}</th>" for name in ("view", "time", *names))
         rows = "".join(
             f"<tr><td class=text>{text(view.name)}</td><td>{view.time:.4f}</td>"
-            + "".join(f"<td>{_number(view.metrics.get(name))}</td>" for name in names)
+            + "".join(
+                f"<td>{'' if (value := view.metrics.get(name)) is None else formatted(name, value)}</td>"
+                for name in names
+            )
             + "</tr>"
             for view in run.views
         )
@@ -213,10 +218,6 @@ def _views(runs: Sequence[EvaluatedRun]) -> str:
             f"{wide(f'<tr>{head}</tr>{rows}')}</details>"
         )
     return "".join(parts)
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.4f}" if abs(value) < 10 else f"{value:.2f}"
 
 
 def _config(runs: Sequence[EvaluatedRun]) -> str:

@@ -9,8 +9,10 @@ import rich.table
 from rich.box import SIMPLE_HEAD
 from rich.text import Text
 
+from warpgs.evaluation.metric import Metric
+
 from .cells import Cell
-from .table import Metric, Row, Statistic, Table, best_means
+from .table import Row, Statistic, Table, best_means
 
 NOTHING = "–"
 """Stands where nothing was measured."""
@@ -32,17 +34,12 @@ LATEX = {c: f"\\{c}" for c in "&%$#_{}"} | {
 ARROWS = {"higher": "↑", "lower": "↓", "": ""}
 
 
-def number(metric: Metric, value: float) -> str:
-    """A value with the digits of its column."""
-    return f"{value:,.{metric.digits}f}"
-
-
 def statistic(metric: Metric, value: Statistic | None) -> str:
     """Mean ± standard deviation."""
     if value is None:
         return NOTHING
-    spread = "" if value.deviation is None else f" ± {number(metric, value.deviation)}"
-    return number(metric, value.mean) + spread
+    spread = "" if value.deviation is None else f" ± {metric.number(value.deviation)}"
+    return metric.number(value.mean) + spread
 
 
 def seeds(row: Row) -> str:
@@ -62,7 +59,7 @@ def texts(table: Table) -> list[list[tuple[str, bool]]]:
                     statistic(metric, value),
                     row.is_complete and value is not None and round(value.mean, metric.digits) == top,
                 )
-                for metric, value, top in zip(table.metrics, row.values, best, strict=True)
+                for metric, value, top in zip(table.metrics.values(), row.values, best, strict=True)
             ),
             (seeds(row), False),
         ]
@@ -72,7 +69,7 @@ def texts(table: Table) -> list[list[tuple[str, bool]]]:
 
 def heads(table: Table) -> list[str]:
     """Titles of the columns, after the first."""
-    return [*(f"{metric.title} {ARROWS[metric.better]}".strip() for metric in table.metrics), "seeds"]
+    return [*(f"{metric.heading} {ARROWS[metric.better]}".strip() for metric in table.metrics.values()), "seeds"]
 
 
 def markdown(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
@@ -111,7 +108,7 @@ def latex(title: str, tables: Sequence[Table], notes: Sequence[str]) -> str:
 
 def _latex_table(title: str, table: Table) -> str:
     arrows = {"higher": r" $\uparrow$", "lower": r" $\downarrow$", "": ""}
-    titles = [escaped(metric.title) + arrows[metric.better] for metric in table.metrics]
+    titles = [escaped(metric.heading) + arrows[metric.better] for metric in table.metrics.values()]
     lines = [
         r"\begin{table}",
         r"\centering",
@@ -147,15 +144,15 @@ def cells_csv(cells: Sequence[tuple[Cell, str, str, Mapping[str, Any] | None]]) 
 
 def means_csv(tables: Sequence[Table]) -> str:
     """One line per line of every table: mean and standard deviation of each metric, unrounded, and numbers of seeds."""
-    metrics = list(dict.fromkeys(metric for table in tables for metric in table.metrics))
+    metrics = {name: metric for table in tables for name, metric in table.metrics.items()}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    pairs = [name for metric in metrics for name in (metric.title, f"{metric.title} deviation")]
+    pairs = [name for metric in metrics.values() for name in (metric.heading, f"{metric.heading} deviation")]
     writer.writerow(["table", "row", *pairs, "seeds", "planned seeds"])
     for table in tables:
         for row in table.rows:
             found = dict(zip(table.metrics, row.values, strict=True))
-            numbers = [n for metric in metrics for n in (found.get(metric) or (None, None))]
+            numbers = [n for key in metrics for n in (found.get(key) or (None, None))]
             counts = [row.done, row.planned] if row.planned else ["", ""]
             writer.writerow([table.title, row.label, *("" if n is None else n for n in numbers), *counts])
     return text.getvalue()

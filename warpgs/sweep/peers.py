@@ -13,7 +13,7 @@ from typing import Any
 from warpgs.config.bounds import MAX_VALUE
 from warpgs.files import read_json
 
-from .table import METRICS, Statistic
+from .table import Statistic, columns
 
 MAX_BYTES = 1 << 20
 
@@ -42,7 +42,7 @@ def _table(where: str, value: Any) -> dict[str, Any]:
 
 
 def _statistic(where: str, key: str, value: Any) -> Statistic:
-    if key not in (known := [metric.key for metric in METRICS]):
+    if key not in (known := columns()):
         raise ValueError(f"{where}: there is no metric {key:.60}, expected {', '.join(known)}")
     numbers = value if isinstance(value, list) else [value]
     valid = all(isinstance(n, int | float) and not isinstance(n, bool) and abs(n) <= MAX_VALUE for n in numbers)

@@ -5,41 +5,8 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-
-class Metric(NamedTuple):
-    """A column.
-
-    Attributes:
-        key: Name in metrics.json; "num_gaussians" is the sum of both branches.
-        title: Head of the column.
-        better: "higher", "lower", or "" where neither is.
-        digits: Digits after the point.
-        unit: One unit of the table in units of metrics.json.
-    """
-
-    key: str
-    title: str
-    better: str
-    digits: int
-    unit: float = 1.0
-
-
-METRICS = (
-    Metric("psnr", "PSNR [dB]", "higher", 2),
-    Metric("ssim", "SSIM", "higher", 4),
-    Metric("ms_ssim", "MS-SSIM", "higher", 4),
-    Metric("lpips", "LPIPS", "lower", 4),
-    Metric("psnr_static", "static [dB]", "higher", 2),
-    Metric("psnr_dynamic", "dynamic [dB]", "higher", 2),
-    Metric("masked_psnr", "mPSNR [dB]", "higher", 2),
-    Metric("masked_ssim", "mSSIM", "higher", 4),
-    Metric("masked_lpips", "mLPIPS", "lower", 4),
-    Metric("train_seconds", "time [min]", "lower", 1, 60.0),
-    Metric("peak_bytes", "memory [GB]", "lower", 2, 1e9),
-    Metric("num_gaussians", "Gaussians", "", 0),
-    Metric("fps", "FPS", "higher", 0),
-)
-"""Columns, in order; one without any value is omitted."""
+from warpgs.evaluation.metric import Metric
+from warpgs.evaluation.metrics import METRICS
 
 ALL_SCENES = "mean"
 """Name of the table of means over captures, in peers.json, too."""
@@ -83,12 +50,12 @@ class Table(NamedTuple):
 
     Attributes:
         title: What it is about.
-        metrics: Its columns.
+        metrics: Its columns, by name.
         rows: Its lines; first the variants, then the peers.
     """
 
     title: str
-    metrics: tuple[Metric, ...]
+    metrics: dict[str, Metric]
     rows: tuple[Row, ...]
 
 
@@ -121,8 +88,13 @@ def make_tables(measured: Measured, labels: Mapping[str, str], peers: Peers) -> 
         seeds = {v: _by_seed(measured, v, chosen) for v in labels}
         rows = [_row(labels[v], found, len(chosen)) for v, found in seeds.items()]
         rows += [row for name, numbers in peers.items() if (row := _peer_row(name, numbers, chosen))]
-        tables.append(_without_empty(Table(title, METRICS, tuple(rows))))
+        tables.append(_without_empty(Table(title, columns(), tuple(rows))))
     return tables
+
+
+def columns() -> dict[str, Metric]:
+    """The metrics of tables; a column without any value is omitted."""
+    return {name: metric for name, metric in METRICS.items() if metric.is_column}
 
 
 def _by_seed(measured: Measured, variant: str, scenes: Sequence[str]) -> dict[int, list[Mapping[str, Any] | None]]:
@@ -137,29 +109,29 @@ def _row(label: str, seeds: Mapping[int, list[Mapping[str, Any] | None]], num_sc
     complete = [
         known
         for group in seeds.values()
-        if len(known := [metrics for metrics in group if metrics is not None]) == num_scenes
+        if len(known := [values for values in group if values is not None]) == num_scenes
     ]
-    values = tuple(_statistic([_mean(metric, group) for group in complete]) for metric in METRICS)
+    values = tuple(_statistic([_mean(name, group) for group in complete]) for name in columns())
     return Row(label, values, len(complete), len(seeds))
 
 
-def _mean(metric: Metric, group: Sequence[Mapping[str, Any]]) -> float | None:
+def _mean(name: str, group: Sequence[Mapping[str, Any]]) -> float | None:
     """Mean over captures; None unless each has the value."""
-    values = [value_of(metric, metrics) for metrics in group]
+    values = [value_of(name, metrics) for metrics in group]
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known and len(known) == len(values) else None
 
 
-def value_of(metric: Metric, metrics: Mapping[str, Any]) -> float | None:
+def value_of(name: str, metrics: Mapping[str, Any]) -> float | None:
     """A metric of one cell, in the unit of the table; None where not measured."""
-    if metric.key == "num_gaussians":
+    if name == "num_gaussians":
         parts = [metrics.get("num_static"), metrics.get("num_dynamic")]
         value = sum(parts) if all(isinstance(part, int) for part in parts) else None  # type: ignore[arg-type]
     else:
-        value = metrics.get(metric.key)
+        value = metrics.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return None
-    return value / metric.unit
+    return value / METRICS[name].scale
 
 
 def _statistic(values: Sequence[float | None]) -> Statistic | None:
@@ -171,28 +143,30 @@ def _statistic(values: Sequence[float | None]) -> Statistic | None:
 
 
 def _peer_row(name: str, numbers: Mapping[str, Mapping[str, Statistic]], scenes: Sequence[str]) -> Row | None:
+    metrics = columns()
     if len(scenes) == 1 or ALL_SCENES in numbers:
         found = numbers.get(scenes[0] if len(scenes) == 1 else ALL_SCENES, {})
-        values = [found.get(metric.key) for metric in METRICS]
+        values = [found.get(key) for key in metrics]
     elif all(scene in numbers for scene in scenes):
-        columns = [[numbers[scene].get(metric.key) for scene in scenes] for metric in METRICS]
-        means = [None if None in column else statistics.fmean(s.mean for s in column if s) for column in columns]
+        by_metric = [[numbers[scene].get(key) for scene in scenes] for key in metrics]
+        means = [None if None in column else statistics.fmean(s.mean for s in column if s) for column in by_metric]
         values = [None if mean is None else Statistic(mean, None) for mean in means]
     else:
         return None
-    scaled = tuple(value and _in_unit(value, metric) for value, metric in zip(values, METRICS, strict=True))
+    scaled = tuple(value and _in_unit(value, metric) for value, metric in zip(values, metrics.values(), strict=True))
     return Row(name, scaled, 0, 0) if any(scaled) else None
 
 
 def _in_unit(value: Statistic, metric: Metric) -> Statistic:
-    return Statistic(value.mean / metric.unit, None if value.deviation is None else value.deviation / metric.unit)
+    return Statistic(value.mean / metric.scale, None if value.deviation is None else value.deviation / metric.scale)
 
 
 def _without_empty(table: Table) -> Table:
     """The table without the columns in which no line has a value."""
     kept = [k for k in range(len(table.metrics)) if any(row.values[k] is not None for row in table.rows)]
     rows = tuple(row._replace(values=tuple(row.values[k] for k in kept)) for row in table.rows)
-    return Table(table.title, tuple(table.metrics[k] for k in kept), rows)
+    metrics = [*table.metrics.items()]
+    return Table(table.title, dict(metrics[k] for k in kept), rows)
 
 
 def best_means(table: Table) -> list[float | None]:
@@ -202,7 +176,7 @@ def best_means(table: Table) -> list[float | None]:
     """
     rows = [row for row in table.rows if row.is_complete]
     best: list[float | None] = []
-    for k, metric in enumerate(table.metrics):
+    for k, metric in enumerate(table.metrics.values()):
         means = [round(value.mean, metric.digits) for row in rows if (value := row.values[k]) is not None]
         choose = {"higher": max, "lower": min}.get(metric.better)
         best.append(choose(means) if choose and len(set(means)) > 1 else None)

@@ -13,7 +13,7 @@ from torch import Tensor
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.errors import one_line
-from warpgs.evaluation.metrics import psnr
+from warpgs.evaluation.image_quality import psnr
 from warpgs.runs import preview
 from warpgs.runs.trained import TrainedScene
 from warpgs.visualize.images import reduced, to_bytes

@@ -13,7 +13,7 @@ from torch.nn.functional import mse_loss
 
 from warpgs.config import RenderSettings, TrainConfig
 from warpgs.data.capture import background_color
-from warpgs.evaluation.metrics import MIN_SQUARED_ERROR
+from warpgs.evaluation.image_quality import MIN_SQUARED_ERROR
 from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.scene import SplitScene
 from warpgs.ops.dropout import dropout
