@@ -1,7 +1,6 @@
 """Numbers out of range are refused by name before training starts."""
 
 import dataclasses
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests import plain
 from tests.scenes import make_camera
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, TrainConfig, scaled, validate
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture
 from warpgs.initialization.fitting import fitted, fitted_bands
-from warpgs.runs.config_file import NAME, read_config, write_config
 from warpgs.training.command import parse
 
 
@@ -94,18 +93,9 @@ def test_the_config_imports_neither_torch_nor_numpy():
     assert run.stdout == "set()\n"
 
 
-def test_a_config_of_defaults_has_no_preset(tmp_path):
-    write_config(tmp_path, TrainConfig())
-    assert read_config(tmp_path).preset is None
+def test_a_config_of_defaults_is_the_preset_best():
+    assert TrainConfig() == PRESETS["best"]
     assert all(config.preset == name for name, config in PRESETS.items())
-
-
-def test_a_config_file_without_newer_fields_has_their_defaults(tmp_path):
-    write_config(tmp_path, TrainConfig())
-    values = json.loads((tmp_path / NAME).read_text())
-    assert values["model"].pop("deformation") == "mlp"
-    (tmp_path / NAME).write_text(json.dumps(values))
-    assert read_config(tmp_path).model.deformation == "mlp"
 
 
 @pytest.mark.parametrize(
@@ -139,7 +129,7 @@ def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, est
     cameras = {"a": make_camera()}
     capture = Capture("shot", cameras, ["a"], [], torch.zeros(0, 3), None, no_frame, estimated_masks=estimated)
     lines: list[str] = []
-    config = TrainConfig(assume=assume, loss=LossConfig(branches_in_stage2=asked))
+    config = plain.config(assume=assume, loss=LossConfig(branches_in_stage2=asked))
     found = fitted(config, capture, lines.append).loss.branches_in_stage2
     distrusted = asked == "given-masks" and estimated and assume == "masks"
     assert found == ("no" if distrusted else "yes" if asked == "given-masks" else asked)
@@ -147,5 +137,5 @@ def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, est
 
 
 def test_without_a_minimum_period_all_frequencies_are_used():
-    assert fitted_bands(ModelConfig(time_bands=10), 3) == 10
+    assert fitted_bands(ModelConfig(time_bands=10, min_period=0.0), 3) == 10
     assert fitted_bands(ModelConfig(time_bands=0, min_period=4.0), 3) == 0

@@ -13,7 +13,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from warpgs.config import DensifyConfig, LossConfig, ModelConfig, Schedule, TrainConfig
+from tests import plain
+from warpgs.config import TrainConfig
 from warpgs.data.loaders import LoadOptions, load_with
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
@@ -26,13 +27,13 @@ from warpgs.training.trainer import Trainer
 
 SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
 
-MODEL = ModelConfig(
+MODEL = plain.model(
     position_bands=2, time_bands=2, depth=2, width=8, skip=1, max_static_points=50, dynamic_points=20, dropout=0.1
 )
 
 # Pretraining takes iterations 0 to 5, stage I 6 to 21 (densified after 9, 13 and 17, opacities reset after 14, pruned
 # after 11, 17 and 21, the weakest after 21, deformed from 9 on), stage II 22 to 31.
-SCHEDULE = Schedule(
+SCHEDULE = plain.schedule(
     pretrain=6,
     stage1=16,
     stage2=10,
@@ -48,12 +49,12 @@ SCHEDULE = Schedule(
 )
 LENGTH = 32
 
-CONFIG = TrainConfig(
+CONFIG = plain.config(
     preset="quick",
     device="cpu",
     model=MODEL,
-    loss=LossConfig(ssim=0.0, acceleration=0.01),
-    densify=DensifyConfig(every=4, gradient=1e-5, max_gaussians=120, weakest=0.01),
+    loss=plain.loss(ssim=0.0, acceleration=0.01),
+    densify=plain.densify(every=4, gradient=1e-5, max_gaussians=120, weakest=0.01),
     schedule=SCHEDULE,
     checkpoint_every=7,
     keep_checkpoints=100,

@@ -2,9 +2,9 @@
 
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from warpgs.cameras import Camera
-from warpgs.config import RenderSettings, TrainConfig
+from warpgs.config import RenderSettings
 from warpgs.export.cloud import Cloud
 from warpgs.export.clouds import Clouds
 from warpgs.model.gaussians import Gaussians
@@ -69,7 +69,7 @@ def trained_scene(num_static=40, num_dynamic=20, seed=0):
     for field in (scene.deformation, scene.appearance):
         for parameter in field.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
-    return TrainedScene(scene.requires_grad_(False), TrainConfig(model=tiny.MODEL, device="cpu"), METADATA)
+    return TrainedScene(scene.requires_grad_(False), plain.config(model=tiny.MODEL, device="cpu"), METADATA)
 
 
 def _random(num):

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from tests import plain
 from tests.initialization.test_initialize import CAMERA, CONFIG, make_capture, views_of, with_frames
 from tests.scenes import HEIGHT, WIDTH, error, generator
-from warpgs.config import LossConfig
 from warpgs.initialization import alignment, initialize
 
 
@@ -39,42 +39,42 @@ def test_exact_depth_is_trusted_whatever_the_tolerance():
     found = aligned(0.0)
     assert (found.errors[:, 0] < 2e-3).all()  # depth is stored in half precision
     assert error(found.alignments, torch.tensor([[1.0, 0.0]] * 3)) < 2e-2
-    assert (found.trust(LossConfig(depth_tolerance=0.03)).weight > 0.99).all()
+    assert (found.trust(plain.loss(depth_tolerance=0.03)).weight > 0.99).all()
 
 
 def test_trust_is_a_half_at_the_tolerance():
     found = aligned(0.1)
     tolerance = found.errors[0, 0].item()
     assert 0.02 < tolerance < 0.1
-    assert error(found.trust(LossConfig(depth_tolerance=tolerance)).weight, torch.full((3,), 0.5)) < 1e-6
-    assert error(found.trust(LossConfig(depth_tolerance=tolerance / 3.0)).weight, torch.full((3,), 0.1)) < 1e-6
+    assert error(found.trust(plain.loss(depth_tolerance=tolerance)).weight, torch.full((3,), 0.5)) < 1e-6
+    assert error(found.trust(plain.loss(depth_tolerance=tolerance / 3.0)).weight, torch.full((3,), 0.1)) < 1e-6
 
 
 def test_depth_that_is_noise_is_not_trusted():
-    assert torch.equal(aligned(0.5, signal=0.0).trust(LossConfig(depth_tolerance=0.03)).weight, torch.zeros(3))
+    assert torch.equal(aligned(0.5, signal=0.0).trust(plain.loss(depth_tolerance=0.03)).weight, torch.zeros(3))
 
 
 def test_without_a_tolerance_every_view_is_trusted():
-    assert torch.equal(aligned(0.1).trust(LossConfig(depth_tolerance=0.0)).weight, torch.ones(3))
-    assert torch.equal(aligned(0.5, signal=0.0).trust(LossConfig(depth_tolerance=0.0)).weight, torch.ones(3))
+    assert torch.equal(aligned(0.1).trust(plain.loss(depth_tolerance=0.0)).weight, torch.ones(3))
+    assert torch.equal(aligned(0.5, signal=0.0).trust(plain.loss(depth_tolerance=0.0)).weight, torch.ones(3))
 
 
 def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
     errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.09, 0.4], [0.35, 0.4]])
-    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_tolerance=0.03))
+    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(plain.loss(depth_tolerance=0.03))
     assert error(trust.weight, torch.tensor([0.5, 0.1, 0.1, 0.0])) < 1e-6  # torch's median is the lower one
 
 
 def test_the_margin_is_a_multiple_of_the_error_of_each_view():
     errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.01, 0.4], [0.02, 0.4]])
-    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(LossConfig(depth_margin=3.0))
+    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(plain.loss(depth_margin=3.0))
     assert error(trust.margin, torch.tensor([0.09, 0.06, 0.03, 0.06])) < 1e-7
     assert torch.equal(trust.weight, torch.ones(4))
 
 
 def test_without_points_nothing_is_refused():
     found = alignment.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf), torch.zeros(2))
-    trust = found.trust(LossConfig(depth_tolerance=0.03, depth_margin=3.0))
+    trust = found.trust(plain.loss(depth_tolerance=0.03, depth_margin=3.0))
     assert torch.equal(trust.weight, torch.ones(2))
     assert torch.equal(trust.margin, torch.zeros(2))
 

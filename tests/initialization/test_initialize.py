@@ -6,9 +6,8 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera
-from warpgs.config import DensifyConfig, ModelConfig, TrainConfig
 from warpgs.data.capture import Capture, Frame
 from warpgs.initialization import alignment, dynamic_points, initialize
 from warpgs.initialization.point_cloud import (
@@ -25,12 +24,12 @@ from warpgs.training.schedule import Protocol
 from warpgs.views.views import Views
 
 CAMERA = make_camera()
-NETWORK = ModelConfig(
+NETWORK = plain.model(
     position_bands=1, time_bands=1, depth=1, width=2, max_static_points=20, dynamic_points=30
 )  # networks do not matter here
-CONFIG = TrainConfig(model=NETWORK)
-GREY = TrainConfig(model=dataclasses.replace(NETWORK, point_colors="grey"))
-UNBOUNDED = TrainConfig(model=dataclasses.replace(NETWORK, bound_sizes=False))
+CONFIG = plain.config(model=NETWORK)
+GREY = plain.config(model=dataclasses.replace(NETWORK, point_colors="grey"))
+UNBOUNDED = plain.config(model=dataclasses.replace(NETWORK, bound_sizes=False))
 DEPTH = 2.5
 BLOCK = (slice(10, 20), slice(15, 35))
 """The dynamic region: 200 pixels."""
@@ -300,8 +299,8 @@ def test_a_few_distant_points_do_not_widen_the_box(distance):
     points = torch.rand(1000, 3, generator=generator())
     far = points.clone()
     far[:3] = distance
-    for plain, widened in zip(scene_box(points), scene_box(far), strict=True):
-        assert error(widened, plain) < 0.01
+    for usual, widened in zip(scene_box(points), scene_box(far), strict=True):
+        assert error(widened, usual) < 0.01
 
 
 def test_points_that_occur_several_times_do_not_narrow_the_box():
@@ -553,7 +552,7 @@ def test_gaussians_of_unknown_depth_are_small_unless_sizes_are_unbounded(config,
 @pytest.mark.parametrize("unit", ["pixel", "extent"])
 def test_offsets_are_in_view_sizes_or_as_in_the_paper_in_scene_units(deformation, unit):
     model = dataclasses.replace(CONFIG.model, deformation=deformation)
-    config = dataclasses.replace(CONFIG, model=model, densify=DensifyConfig(unit=unit, split_size=0.01))
+    config = dataclasses.replace(CONFIG, model=model, densify=plain.densify(unit=unit, split_size=0.01))
     capture = make_capture(points_at([12, 2], [20, 20]))
     field = initialize.initial_scene(config, capture, generator()).deformation
     units = (field.network if deformation == "splines" else field).units

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
+from tests import plain
 from tests.scenes import error, generator, relative_error
-from warpgs.config import ModelConfig, TrainConfig
 from warpgs.initialization import motion_fit
 from warpgs.initialization.dynamic_points import DynamicPoints, to_canonical
 from warpgs.initialization.motion_fit import MAX_ERROR, fit_motion
@@ -19,7 +19,7 @@ VIEW_SIZE = 4.0
 TIMES = torch.linspace(0, 1, NUM_VIEWS)
 COLORS = torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.1, 0.9]])
 """Colours of the two objects."""
-MODEL = ModelConfig(position_bands=4, time_bands=4, depth=3, width=64, skip=2, half=False)
+MODEL = plain.model(position_bands=4, time_bands=4, depth=3, width=64, skip=2, half=False)
 
 
 def centers(time):
@@ -53,8 +53,8 @@ def new_deformation(device="cpu", **model):
 
 
 def fit(found, deformation, num_steps=300, is_stopped=bool, graph=True):
-    schedule = dataclasses.replace(TrainConfig().schedule, fit_motion=num_steps)
-    config = dataclasses.replace(TrainConfig(), schedule=schedule, graph=graph)
+    schedule = dataclasses.replace(plain.config().schedule, fit_motion=num_steps)
+    config = dataclasses.replace(plain.config(), schedule=schedule, graph=graph)
     return fit_motion(deformation, found, TIMES, VIEW_SIZE, config, generator(), is_stopped)
 
 

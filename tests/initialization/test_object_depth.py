@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from warpgs.cameras import Camera
 from warpgs.captures.opening import load_capture
-from warpgs.config import LossConfig
 from warpgs.data import dynamic_regions
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.dynamic_regions import unknown_depth
@@ -31,7 +30,7 @@ NUM = 30
 WALL = 2.0
 """Depth of a wall of static points behind everything."""
 
-CONFIG = dataclasses.replace(tiny.CONFIG, loss=LossConfig(object_depth=True))
+CONFIG = dataclasses.replace(tiny.CONFIG, loss=plain.loss(object_depth=True))
 
 
 def ellipse(column: float, row: float, axes: tuple[float, float], angle: float = 0.0) -> np.ndarray:

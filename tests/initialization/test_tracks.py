@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from warpgs.cameras import Camera
 from warpgs.captures.opening import load_capture
-from warpgs.config import OptimConfig, RenderSettings, Schedule, TrainConfig
+from warpgs.config import RenderSettings
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture, Frame
 from warpgs.initialization import tracks as module
@@ -176,7 +176,7 @@ def test_tracks_can_be_switched_off(capture):
 
 
 def test_splines_are_refused_where_nothing_is_tracked(tmp_path):
-    config = TrainConfig(model=dataclasses.replace(TrainConfig().model, deformation="splines"))
+    config = plain.config(model=dataclasses.replace(plain.config().model, deformation="splines"))
     with pytest.raises(ValueError, match="no small objects are tracked"):
         fitted(config, load_capture(tiny.write(tmp_path)), print)
 
@@ -184,8 +184,8 @@ def test_splines_are_refused_where_nothing_is_tracked(tmp_path):
 @pytest.fixture
 def trainer(data, capture, tmp_path):
     model = dataclasses.replace(tiny.MODEL, dynamic_points=500)
-    schedule = Schedule(stage1=20, stage2=10, densify_until=0, reset_every=1_000, prune_every=1_000)
-    optim = OptimConfig(opacities=0.3)
+    schedule = plain.schedule(stage1=20, stage2=10, densify_until=0, reset_every=1_000, prune_every=1_000)
+    optim = plain.optim(opacities=0.3)
     config = dataclasses.replace(tiny.CONFIG, background="capture", model=model, schedule=schedule, optim=optim)
     return tiny.trainer(data, tmp_path / "run", fitted(config, capture, print))
 

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from tests import plain
 from tests.reference.encoding import encode
 from tests.reference.mlp import perceptron
 from tests.scenes import error, generator, random_like, relative_error
-from warpgs.config import ModelConfig
 from warpgs.config.presets import PRESETS
 from warpgs.model.appearance import AppearanceField
 from warpgs.model.fields import FIELDS, make_deformation
@@ -27,7 +27,7 @@ SHAPES = [(8, 4), (3, 2), (3, 1), (1, 4), (4, 4)]
 
 def model(**changes):
     sizes = {"position_bands": 3, "time_bands": 2, "width": 16, "sh_degree": 3, "appearance_opacity": True}
-    return ModelConfig(**{**sizes, **changes})
+    return plain.model(**{**sizes, **changes})
 
 
 def randomize_head(trunk):
@@ -105,7 +105,7 @@ def test_layers_are_initialized_as_those_of_torch():
 
 
 def test_the_default_trunk_has_eight_layers_of_256_units():
-    trunk = Trunk(ModelConfig(), CENTER, HALF_SIZE, (OUTPUTS,))
+    trunk = Trunk(plain.model(), CENTER, HALF_SIZE, (OUTPUTS,))
     encoded = 3 * 21 + 21
     shapes = [weight.shape for weight, _ in trunk.layers(trunk.values)]
     columns = [encoded, 256, 256, 256, 256 + encoded, 256, 256, 256]
@@ -228,7 +228,7 @@ class Drift(torch.nn.Module):
 
 
 def scene_with(name):
-    return SplitScene.empty(3, 4, ModelConfig(depth=1, width=2, deformation=name))
+    return SplitScene.empty(3, 4, plain.model(depth=1, width=2, deformation=name))
 
 
 def test_a_deformation_model_that_is_added_to_the_dictionary_deforms_the_scene(monkeypatch):
@@ -248,4 +248,4 @@ def test_an_unknown_deformation_model_is_refused_with_the_names_of_the_known_one
 
 
 def test_the_default_deformation_model_is_that_of_the_paper():
-    assert type(make_deformation(ModelConfig(depth=1, width=2), CENTER, HALF_SIZE)) is MlpDeformation
+    assert type(make_deformation(plain.model(depth=1, width=2), CENTER, HALF_SIZE)) is MlpDeformation

@@ -6,9 +6,10 @@ import sys
 import pytest
 import torch
 
+from tests import plain
 from tests.reference.covariance import covariance, rotation
 from tests.scenes import as_gaussians, error, generator, make_camera, make_splats, relative_error
-from warpgs.config import ModelConfig, RenderSettings
+from warpgs.config import RenderSettings
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.rendering import render
@@ -20,7 +21,7 @@ GEOMETRY = ("means", "quats", "scales")
 
 
 def model(**changes):
-    return ModelConfig(position_bands=2, time_bands=2, depth=3, width=8, skip=1, sh_degree=3, **changes)
+    return plain.model(position_bands=2, time_bands=2, depth=3, width=8, skip=1, sh_degree=3, **changes)
 
 
 def make_scene(num_static=NUM_STATIC, num_dynamic=NUM_DYNAMIC, trained=True, **changes):
@@ -242,7 +243,7 @@ def test_a_scene_is_made_on_the_meta_device_without_the_compiler_of_torch():
         "from warpgs.config import ModelConfig\n"
         "from warpgs.model.scene import SplitScene\n"
         "with torch.device('meta'):\n"
-        "    SplitScene.empty(5, 4, ModelConfig())\n"
+        "    SplitScene.empty(5, 4, plain.model())\n"
         "print('torch._dynamo' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"

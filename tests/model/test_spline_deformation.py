@@ -5,8 +5,8 @@ import pytest
 import torch
 from scipy.interpolate import BSpline
 
+from tests import plain
 from tests.scenes import error, generator
-from warpgs.config import ModelConfig
 from warpgs.model.spline_deformation import SplineDeformation
 
 NUM_PATHS, NUM_POINTS = 3, 9
@@ -14,7 +14,7 @@ NUM_PATHS, NUM_POINTS = 3, 9
 
 @pytest.fixture
 def model():
-    config = ModelConfig(position_bands=2, time_bands=2, depth=2, width=8, paths=NUM_PATHS, path_points=NUM_POINTS)
+    config = plain.model(position_bands=2, time_bands=2, depth=2, width=8, paths=NUM_PATHS, path_points=NUM_POINTS)
     found = SplineDeformation(config, torch.zeros(3), torch.ones(3))
     found.paths.data.copy_(torch.randn(found.paths.shape, generator=generator()))
     found.homes.copy_(torch.eye(3))

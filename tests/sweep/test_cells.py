@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from tests import plain
 from tests.data import layouts
-from warpgs.config import LossConfig, TrainConfig
+from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.writer import STATE, WORK
 from warpgs.sweep.cells import (
@@ -66,7 +67,7 @@ def test_every_line_about_best_trains_something_else(tmp_path):
 
 def test_every_term_of_the_loss_that_best_changes_has_a_line_and_so_has_the_fit_of_motion(tmp_path):
     configs = [cell.config for cell in plan(read_spec("best"), out=tmp_path)]
-    best, usual = PRESETS["best"].loss, LossConfig()
+    best, usual = PRESETS["best"].loss, plain.loss()
     for field in dataclasses.fields(best):
         if getattr(best, field.name) != getattr(usual, field.name):
             assert any(getattr(c.loss, field.name) != getattr(best, field.name) for c in configs), field.name

@@ -7,10 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from tests.scenes import as_gaussians, generator, make_camera, make_splats, select
 from warpgs.cameras import Camera
-from warpgs.config import LossConfig
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.ops.dropout import MAX_SEED
@@ -26,7 +25,7 @@ CAMERA = Camera(torch.eye(4), torch.tensor([[400.0, 0.0, 240.0], [0.0, 400.0, 13
 def measured(paths, camera=CAMERA, num_static=0):
     """The term for [3, K, 3] paths in a view of 100 pixels."""
     view = SimpleNamespace(camera=camera, static_mask=torch.arange(100).view(10, 10) < num_static)
-    return acceleration(LossInputs(LossConfig(), view, None, None, None, None, None, paths))
+    return acceleration(LossInputs(plain.loss(), view, None, None, None, None, None, paths))
 
 
 def accelerated(pixels, depth=2.0):

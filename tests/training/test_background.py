@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig, validate
 from warpgs.data.capture import background_color
@@ -130,9 +130,9 @@ def test_a_run_without_a_background_stays_over_black_with_empty_pixels_to_paint(
 
 @pytest.mark.parametrize("asked", ["black", "white"])
 def test_an_option_overrides_the_background_of_the_capture(capture, asked):
-    config = fitted(TrainConfig(background=asked), capture, print)
+    config = fitted(plain.config(background=asked), capture, print)
     assert config.background == asked
-    assert fitted(TrainConfig(), capture, print).background == "white"
+    assert fitted(plain.config(), capture, print).background == "white"
     assert (capture.over(asked).frame("train_r_000").empty is None) == (asked == "black")
 
 
@@ -180,7 +180,7 @@ def test_the_psnr_of_training_is_finite_where_nothing_is_wrong(run, tmp_path):
 def test_a_trainer_refuses_a_background_that_was_not_looked_up(capture, tmp_path, background):
     assert capture.background == "white"
     with pytest.raises(ValueError, match=f'background is "{background}": call fitted'):
-        Trainer(TrainConfig(device="cpu", background=background), capture, tmp_path)
+        Trainer(plain.config(device="cpu", background=background), capture, tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -230,8 +230,8 @@ def test_a_resumed_run_goes_on_as_it_would_have(name, request, tmp_path):
 
 
 def test_a_capture_over_white_stays_so_where_others_get_the_mean(capture):
-    assert fitted(TrainConfig(background="mean"), capture, print).background == "white"
-    assert fitted(TrainConfig(background="mean"), capture.over("black"), print).background == mean_color(capture)
+    assert fitted(plain.config(background="mean"), capture, print).background == "white"
+    assert fitted(plain.config(background="mean"), capture.over("black"), print).background == mean_color(capture)
 
 
 def test_the_mean_of_many_frames_is_that_of_some_of_them(capture, monkeypatch):
@@ -259,7 +259,7 @@ def test_a_background_may_be_given_in_rgb(capture, words, expected):
 @pytest.mark.parametrize("background", ["grey", [0.1, 0.2, 0.3], (0.5, 0.5), (0.5, 0.5, 1.5), 0.5])
 def test_a_background_that_is_no_colour_is_refused_before_training(background):
     with pytest.raises(ValueError, match="background must be capture, mean, black, white, or three numbers"):
-        validate(TrainConfig(background=background))
+        validate(plain.config(background=background))
 
 
 def test_a_colour_that_is_not_known_yet_is_not_black():

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from tests import plain
 from tests.reference.ssim import ssim_map
 from tests.scenes import (
     as_gaussians,
@@ -16,7 +17,7 @@ from tests.scenes import (
     relative_error,
     select,
 )
-from warpgs.config import DensifyConfig, LossConfig, ModelConfig, RenderSettings, Schedule, TrainConfig
+from warpgs.config import RenderSettings
 from warpgs.data.capture import Capture, Frame
 from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.scene import SplitScene
@@ -121,7 +122,7 @@ VIEW_MASK = torch.arange(CAMERA.width).expand(CAMERA.height, -1) < 30
 VIEW_IMAGE = torch.randint(0, 256, (CAMERA.height, CAMERA.width, 3), generator=generator(), dtype=torch.uint8)
 INVERSE_DEPTH = torch.rand(CAMERA.height, CAMERA.width, generator=generator()).half().float()
 ALIGNMENTS = torch.tensor([[0.5, 0.1]])
-LOSS = LossConfig(
+LOSS = plain.loss(
     ssim=0.3,
     static=0.5,
     dynamic=0.7,
@@ -130,9 +131,9 @@ LOSS = LossConfig(
     depth_dynamic=0.4,
     depth_end=2.0,  # no decay
 )
-NOTHING = LossConfig(static=0.0, dynamic=0.0, joint=0.0, depth=0.0)
-NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2, sh_degree=3)
-SCHEDULE = Schedule(pretrain=2_000, stage1=30_000, stage2=40_000, deform_from=100, appearance_from=100)
+NOTHING = plain.loss(static=0.0, dynamic=0.0, joint=0.0, depth=0.0)
+NETWORK = plain.model(position_bands=1, time_bands=1, depth=1, width=2, sh_degree=3)
+SCHEDULE = plain.schedule(pretrain=2_000, stage1=30_000, stage2=40_000, deform_from=100, appearance_from=100)
 VIEW_SIZE = 3.0
 STAGES = {"pretrain": 0, "stage1": 2_000, "stage2": 32_000}
 """First iteration of each stage."""
@@ -142,7 +143,7 @@ def prepared(stage, loss=LOSS, at=0, trust=(1.0, 0.0), schedule=SCHEDULE, **opti
     """A scene, the plan of an iteration of a stage, by default of the first, and a step that trains the scene."""
     frame = Frame("a", CAMERA, VIEW_IMAGE, VIEW_MASK, INVERSE_DEPTH)
     capture = Capture("made up", {"a": CAMERA}, ["a"], [], torch.zeros(0, 3), None, lambda name: frame)
-    config = TrainConfig(model=NETWORK, loss=loss, schedule=schedule, **options)
+    config = plain.config(model=NETWORK, loss=loss, schedule=schedule, **options)
     static, dynamic = (as_gaussians(select(SPLATS, chosen)) for chosen in (~SPLATS.is_dynamic, SPLATS.is_dynamic))
     scene = SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
     plan = Protocol(config, has_depth=True).at(STAGES[stage] + at)
@@ -256,7 +257,7 @@ def terms_with_trust(weight, margin, loss=LOSS, **options):
 def test_lengths_in_the_loss_are_in_view_sizes_or_as_in_the_paper_in_scene_units():
     loss = dataclasses.replace(LOSS, scale=5.0)
     in_views, in_scene = (
-        terms_with_trust(1.0, 0.0, loss, densify=DensifyConfig(unit=unit, split_size=0.01))
+        terms_with_trust(1.0, 0.0, loss, densify=plain.densify(unit=unit, split_size=0.01))
         for unit in ("pixel", "extent")
     )
     lengths = {"depth", "depth_dynamic", "scale"}

@@ -5,10 +5,9 @@ import math
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from tests.reference.adam import adam
 from tests.scenes import error, generator, random_gaussians
-from warpgs.config import ModelConfig, OptimConfig
 from warpgs.model.gaussians import PARAMETERS
 from warpgs.model.scene import SplitScene
 from warpgs.training.optimizer import (
@@ -22,11 +21,11 @@ from warpgs.training.optimizer import (
     reset_moments,
 )
 
-NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=2, width=3)
+NETWORK = plain.model(position_bands=1, time_bands=1, depth=2, width=3)
 NETWORKS = ("deformation", "appearance")
 START = dict.fromkeys(NETWORKS, 0.0)
 END = dict.fromkeys(NETWORKS, 1.0)
-RATES = OptimConfig(
+RATES = plain.optim(
     means=0.1, quats=0.2, scales=0.3, opacities=0.4, sh_dc=0.5, sh_rest=0.6, networks=0.7, networks_end=0.07
 )
 
@@ -220,7 +219,7 @@ def test_the_rate_of_positions_decays_to_a_hundredth_in_a_unit(progress, factor)
 
 @pytest.mark.parametrize("unit", [0.3, 7.0])
 def test_the_rate_of_positions_can_have_a_scale_of_its_own_whatever_the_scene(unit):
-    config = OptimConfig(means=1.6e-4, means_scale=5.0)
+    config = plain.optim(means=1.6e-4, means_scale=5.0)
     start, end = (rates_at(k, START, unit, config)["dynamic.means"] for k in (0.0, 1.0))
     assert start == pytest.approx(8e-4)
     assert end == pytest.approx(8e-6)
@@ -254,7 +253,7 @@ def test_each_network_has_its_own_progress():
 
 
 def test_the_default_rates_of_networks_are_those_of_the_paper():
-    now, later = rates_at(0.0, START, config=OptimConfig()), rates_at(1.0, END, config=OptimConfig())
+    now, later = rates_at(0.0, START, config=plain.optim()), rates_at(1.0, END, config=plain.optim())
     for name in NETWORKS:
         assert now[name] == pytest.approx(8e-4)
         assert later[name] == pytest.approx(1.6e-6)

@@ -6,12 +6,13 @@ from typing import get_args
 
 import pytest
 
-from warpgs.config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig, scaled
+from tests import plain
+from warpgs.config import scaled
 from warpgs.config.presets import PRESETS
 from warpgs.training.loss_terms import TERMS
 from warpgs.training.schedule import Action, Phase, Protocol
 
-SHORT = Schedule(
+SHORT = plain.schedule(
     pretrain=20,
     stage1=100,
     stage2=80,
@@ -26,11 +27,11 @@ SHORT = Schedule(
     noise_until=40,
     sh_degree_every=12,
 )
-CONFIG = TrainConfig(
+CONFIG = plain.config(
     schedule=SHORT,
-    densify=DensifyConfig(every=10),
-    model=ModelConfig(sh_degree=3),
-    loss=LossConfig(depth=2.0, depth_end=0.02),
+    densify=plain.densify(every=10),
+    model=plain.model(sh_degree=3),
+    loss=plain.loss(depth=2.0, depth_end=0.02),
 )
 STAGE1, STAGE2, END = 20, 120, 200
 """First iterations of the stages of ``SHORT``, and its length."""
@@ -147,7 +148,7 @@ def test_without_stage_2_there_is_no_joint_term():
 
 @pytest.mark.parametrize("degree", range(4))
 def test_the_sh_degree_never_exceeds_that_of_the_model(degree):
-    degrees = {plan.phase.sh_degree for plan in plans(model=ModelConfig(sh_degree=degree))}
+    degrees = {plan.phase.sh_degree for plan in plans(model=plain.model(sh_degree=degree))}
     assert degrees == set(range(degree + 1))
 
 
@@ -157,7 +158,7 @@ def test_noise_until_iteration_0_ends_after_one_iteration():
 
 
 def test_the_depth_weight_may_decay_to_zero():
-    weights = values_of("depth_weight", loss=LossConfig(depth=2.0, depth_end=0.0))
+    weights = values_of("depth_weight", loss=plain.loss(depth=2.0, depth_end=0.0))
     assert weights[0] == pytest.approx(2.0)
     assert weights[-1] == pytest.approx(0.0, abs=1e-9)
 
@@ -181,14 +182,14 @@ def after(*done):
 
 
 DROPPING = {"model": dataclasses.replace(CONFIG.model, dropout=0.1)}
-NEEDLES = {"densify": DensifyConfig(every=50, max_elongation=10.0)}
-WEAKEST = {"densify": DensifyConfig(every=10, weakest=0.02)}
+NEEDLES = {"densify": plain.densify(every=50, max_elongation=10.0)}
+WEAKEST = {"densify": plain.densify(every=10, weakest=0.02)}
 WAITING = {"schedule": {"appearance_from": None}}
 LATE = {"schedule": {"appearance_from": 1000, "deform_from": 1000}}
 SETTLING = {"schedule": {"settle": 30}}
 OFTEN = {"schedule": {"prune_every": 10, "warmup": 20}}
-RESEED = {"densify": DensifyConfig(every=10, reseed=0.05), **OFTEN}
-NO_DEPTH = {"loss": LossConfig(depth=0.0)}
+RESEED = {"densify": plain.densify(every=10, reseed=0.05), **OFTEN}
+NO_DEPTH = {"loss": plain.loss(depth=0.0)}
 
 
 def last(first):
@@ -280,7 +281,7 @@ def rising_from(first):
     return [0.0] * first + [k / (END - first) for k in range(END - first)]
 
 
-TRAINED = {"optim": OptimConfig(means_anneal="trained")}
+TRAINED = {"optim": plain.optim(means_anneal="trained")}
 LATE_MOTION, LATE_COLOURS = ({"schedule": {name: 1000}} for name in ("deform_from", "appearance_from"))
 UNTIL_STAGE2 = [min(1.0, k / STAGE2) for k in range(END)]
 SETTLED = [0.0] * (END - 30) + [k / 30 for k in range(30)]
@@ -298,7 +299,7 @@ COURSES = {
     "the SH degree rises in steps from stage 1 on": ("sh_degree", {}, DEGREES),
     "noise on time decays linearly from a tenth of a frame interval": ("time_noise", {}, NOISE),
     "the depth weight decays exponentially": ("depth_weight", {}, [2.0 * 0.01 ** (k / END) for k in range(END)]),
-    "the depth weight may stay constant": ("depth_weight", {"loss": LossConfig(depth=2.0, depth_end=2.0)}, [2.0] * END),
+    "the depth weight may stay constant": ("depth_weight", {"loss": plain.loss(depth=2.0, depth_end=2.0)}, [2.0] * END),
     "progress rises linearly from zero to one": ("progress", {}, rising_from(0)),
     "that of static positions can end before stage 2": ("means_progress.static", TRAINED, UNTIL_STAGE2),
     "but not if stage 2 trains them": ("means_progress.static", {"static_geometry": True, **TRAINED}, rising_from(0)),
@@ -425,6 +426,8 @@ def test_without_warmup_networks_start_at_their_full_rate():
 
 @pytest.mark.parametrize("joint_from", [None, 0, 3])
 def test_the_joint_image_is_compared_from_its_iteration_of_stage_1_on(joint_from):
-    protocol = Protocol(TrainConfig(schedule=Schedule(pretrain=2, stage1=5, stage2=2, joint_from=joint_from)), True)
+    protocol = Protocol(
+        plain.config(schedule=plain.schedule(pretrain=2, stage1=5, stage2=2, joint_from=joint_from)), True
+    )
     start = protocol.stage2.start if joint_from is None else protocol.stage1.start + joint_from
     assert [protocol.phase_at(i).with_joint for i in range(9)] == [i >= start for i in range(9)]

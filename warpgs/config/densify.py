@@ -17,7 +17,7 @@ class DensifyConfig:
     ``max_gaussians``, and for which its authors set ``loss.opacity`` and ``loss.scale`` to 0.01 (mcmc)."""
     every: Annotated[int, Bounds(min=1)] = 100
     """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
-    gradient: float = 2e-4
+    gradient: float = 3e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
     unit: Literal["pixel", "extent"] = "pixel"
     """Unit of ``split_size`` and ``max_size``, which are standard deviations: a pixel of the nearest training view that
@@ -32,20 +32,20 @@ class DensifyConfig:
     max_size: Annotated[float, Bounds(positive=True)] = 20.0
     """Size above which a Gaussian is removed once opacities have been reset, and above which ``max_elongation``
     holds."""
-    max_elongation: float = 0.0
+    max_elongation: float = 10.0
     """After every ``every`` iterations and at the end, the longest axis of static Gaussians is cut to this many times
     their second longest, or to ``max_size`` if that is longer. 0: never."""
     noise: float = 5e5
     """Factor of the noise on positions in strategy mcmc, next to their learning rate and covariance."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
-    min_pixels: int = 0
+    min_pixels: int = 24
     """Minimum number of training pixels per Gaussian: densification stops where there are fewer. 0: no limit."""
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
-    reseed: Annotated[float, Bounds(max=1)] = 0.0
+    reseed: Annotated[float, Bounds(max=1)] = 0.05
     """Fraction of the training views' dynamic pixels. If at least so many show no dynamic Gaussian, new ones start at
     the next pruning during densification. 0: only if no dynamic Gaussian is left."""
-    weakest: Annotated[float, Bounds(max=0.99)] = 0.0
+    weakest: Annotated[float, Bounds(max=0.99)] = 0.01
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""

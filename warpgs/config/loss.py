@@ -18,44 +18,44 @@ class LossConfig:
     """Weight of the dynamic image against the masked ground truth (Eq. 12)."""
     joint: float = 1.0
     """Weight of the joint image against the whole ground truth, in stage II and from ``schedule.joint_from`` on."""
-    squared: float = 0.0
+    squared: float = 15.0
     """Weight of the squared error of the joint image beside its L1, wherever the joint image is compared; 0 in the
     paper. Large errors vanish sooner and fewer remain."""
-    acceleration: float = 0.0
+    acceleration: float = 0.1
     """Weight of the acceleration of dynamic Gaussians on screen [per pixel per frame²], times the dynamic fraction of
     the image; 0 in the paper. Images say nothing of the times between frames."""
-    hidden_appearance: bool = True
+    hidden_appearance: bool = False
     """Whether the joint image also trains how static Gaussians change over time while something dynamic hides them, as
     in the paper. No object is quite opaque, so that what it hides takes its colour."""
-    dynamic_background: Literal["black", "random"] = "random"
+    dynamic_background: Literal["black", "random"] = "black"
     """Background of the dynamic image unless ``background`` is white: black (paper), or random, hiding no Gaussian."""
-    depth: float = 2.0
+    depth: float = 0.5
     """Initial λ_depth, the weight of the static image's depth in the static region (Eq. 14) [view sizes; scene units
     if ``densify.unit`` is extent (paper)]."""
-    depth_dynamic: float = 1.0
+    depth_dynamic: float = 4.0
     """Weight of the dynamic image's depth in the dynamic region, relative to λ_depth; 0 in the paper."""
     depth_end: float = 0.2
     """Final λ_depth; it decays exponentially."""
     depth_gate: bool = True
     """Whether depth is compared only where the rendered opacity exceeds a half; paper Eq. 14 compares it everywhere."""
-    branches_in_stage2: Literal["yes", "no", "given-masks"] = "yes"
+    branches_in_stage2: Literal["yes", "no", "given-masks"] = "given-masks"
     """Whether stage II keeps the terms of the single branches (Eq. 9, 12, 14) beside the joint image, as Eq. 15 does,
     or compares that image alone, as the authors' code does; given-masks: keeps them unless `prepare` made the masks."""
-    depth_tolerance: float = 0.0
+    depth_tolerance: float = 0.03
     """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
     by 1 + (error / tolerance)², and depth hardly better than a constant is not used. 0: equal weights (paper)."""
-    depth_margin: float = 0.0
+    depth_margin: float = 3.0
     """Errors of the static depth up to this many times the relative error of the view's aligned depth at the sparse
     points are not penalized, because the images determine the geometry better. 0: every error is (paper)."""
-    depth_smooth: bool = False
+    depth_smooth: bool = True
     """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
-    object_depth: bool = False
+    object_depth: bool = True
     """Whether dynamic objects of unknown depth get one by their size, and uncertain depth of objects is averaged with
     that (docs/design/object-depth.md)."""
     opacity: float = 0.0
     """Weight of the mean opacity of all Gaussians."""
     scale: float = 0.0
     """Weight of the mean standard deviation of all Gaussians along their axes [view sizes]."""
-    mask_margin: Annotated[float, Bounds(max=1)] = 0.0
+    mask_margin: Annotated[float, Bounds(max=1)] = 0.008
     """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
     image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""

@@ -10,22 +10,22 @@ from .bounds import Bounds
 class ModelConfig:
     """Sizes of the two networks and of the initial Gaussians."""
 
-    position_bands: Annotated[int, Bounds(max=64)] = 10
+    position_bands: Annotated[int, Bounds(max=64)] = 6
     """Number of frequencies L in the encoding of positions (paper Eq. 6)."""
-    time_bands: Annotated[int, Bounds(max=64)] = 10
+    time_bands: Annotated[int, Bounds(max=64)] = 6
     """Number of frequencies L in the encoding of time: 10 for real captures, 6 for synthetic ones (paper Eq. 6)."""
     raw_input: bool = True
     """Whether the networks get position and time beside their encodings, as in Deformable-3DGS; not in paper Eq. 6."""
-    min_period: float = 0.0
+    min_period: float = 4.0
     """Minimum period of the frequencies in the encoding of time [training frames]; higher frequencies overfit and are
     dropped. 0: all are kept (paper)."""
     depth: Annotated[int, Bounds(min=1, max=64)] = 8
     """Number of hidden layers of each network."""
     width: Annotated[int, Bounds(min=1, max=4096)] = 256
     """Number of units per hidden layer."""
-    appearance_depth: Annotated[int | None, Bounds(min=1, max=64)] = None
+    appearance_depth: Annotated[int | None, Bounds(min=1, max=64)] = 4
     """Number of hidden layers of the appearance network; as ``depth`` if None."""
-    appearance_width: Annotated[int | None, Bounds(min=1, max=4096)] = None
+    appearance_width: Annotated[int | None, Bounds(min=1, max=4096)] = 128
     """Number of units per hidden layer of the appearance network; that of both networks if None."""
     skip: int = 4
     """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS), unless it is the last one."""
@@ -36,7 +36,7 @@ class ModelConfig:
     path_points: Annotated[int, Bounds(min=4, max=65_536)] = 4
     """Number of control points of each spline of the deformation model "splines"; training sets it by the number of
     frames."""
-    sh_degree: int = 1
+    sh_degree: int = 3
     """Maximum degree of spherical harmonics."""
     appearance_degree: int = 0
     """Maximum degree of spherical harmonics that the appearance network changes."""
@@ -57,7 +57,7 @@ class ModelConfig:
     of dynamic Gaussians of unknown depth under 1.9 % of the view size; 3DGS has no such bounds."""
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
-    dropout: Annotated[float, Bounds(max=0.9)] = 0.0
+    dropout: Annotated[float, Bounds(max=0.9)] = 0.1
     """Fraction of the Gaussians that each iteration of stages I and II omits at random, while the opacities of the
     others are divided by one minus it, so that none relies on a few others (DropGaussian). 0: none (paper)."""
     tracks: bool = True

@@ -10,7 +10,7 @@ from .bounds import Bounds
 class OptimConfig:
     """Learning rates of Adam; those of Deformable-3DGS where the paper names none."""
 
-    means: float = 1.6e-4
+    means: float = 5e-4
     """Positions, times ``means_scale``; decays exponentially to 1 %."""
     means_scale: Annotated[float | None, Bounds(positive=True)] = None
     """Factor of the rate of positions: the view size of the capture if None, 5 in Deformable-3DGS, which the paper
@@ -28,7 +28,7 @@ class OptimConfig:
     """Spherical harmonics of degree 0."""
     sh_rest: float = 1.25e-4
     """Spherical harmonics of higher degrees."""
-    poses: float = 0.0
+    poses: float = 5e-5
     """Initial rate of the corrections of camera poses [rad, and fractions of the view size]; decays exponentially to
     1 %. 0: cameras stay as the capture has them (paper)."""
     networks: Annotated[float, Bounds(positive=True)] = 8e-4

@@ -43,10 +43,10 @@ class TrainConfig:
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None
     """Run folder to continue from its newest checkpoint; a larger --iterations extends it."""
-    preset: Literal["paper", "best", "patient", "quick"] | None = None
+    preset: Literal["paper", "best", "patient", "quick"] | None = "best"
     """Defaults of everything below: best (one GPU, minutes), paper (as published, 72k iterations; docs/method.md),
     patient (two CPU cores, 10 minutes), quick (two CPU cores, minutes). On the command line the default is best for a
-    capture and quick for the built-in scene; in Python it is none."""
+    capture and quick for the built-in scene; ``TrainConfig()`` is best. None: one that an earlier version had."""
     iterations: Annotated[int | None, Bounds(min=3)] = None
     """Total iterations; every schedule is rescaled to it."""
     device: Literal["cuda", "cpu"] | None = None
@@ -66,19 +66,19 @@ class TrainConfig:
     """Joint optimization; without it, its iterations are added to stage I."""
     assume: Literal["masks", "static", "dynamic"] = "masks"
     """What moves: what the masks mark, nothing (static), or everything (dynamic)."""
-    try_masks: bool = False
+    try_masks: bool = True
     """Try out masks that `prepare` made in two short trainings, with them and without, before runs that are longer, and
     take everything as dynamic if held-out frames are better without."""
-    background: BackgroundName | tuple[float, float, float] = "capture"
+    background: BackgroundName | tuple[float, float, float] = "mean"
     """Colour behind all Gaussians: that of the capture, which is white if D-NeRF's images have alpha, else black; the
     same, but the mean colour of the training frames instead of black (mean); or red, green and blue in [0, 1]."""
-    static_geometry: bool = False
+    static_geometry: bool = True
     """Whether stage II still optimizes positions, scales and rotations of static Gaussians."""
-    static_appearance: bool = False
+    static_appearance: bool = True
     """Whether stage II still optimizes w⁰, the appearance to which residuals are added."""
-    exposure: bool = False
+    exposure: bool = True
     """Divide jumps of exposure and white balance between frames out of the training images."""
-    antialias: bool = False
+    antialias: bool = True
     """Compensate opacities for the low-pass filter (Mip-Splatting)."""
     max_alpha: Annotated[float, ALPHA_BOUNDS] = RenderSettings.max_alpha
     """Maximum alpha of a Gaussian in a pixel: 0.999 as in gsplat; 0.99 in 3DGS (paper)."""
@@ -90,7 +90,7 @@ class TrainConfig:
     optim: OptimConfig = field(default_factory=OptimConfig)
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     schedule: Schedule = field(default_factory=Schedule)
-    checkpoint_every: Annotated[int, Bounds(min=1)] = 5_000
+    checkpoint_every: Annotated[int, Bounds(min=1)] = 2_500
     """Iterations between checkpoints."""
     keep_checkpoints: Annotated[int, Bounds(min=1)] = 2
     """Number of newest checkpoints to keep."""

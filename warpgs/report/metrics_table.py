@@ -72,8 +72,7 @@ def config_rows(configs: Sequence[TrainConfig]) -> list[tuple[str, list[str]]]:
     flat = [dict(_flat("", config)) for config in configs]
     rows = list(flat)
     if len(flat) == 1:
-        preset = configs[0].preset
-        flat.append(dict(_flat("", TrainConfig() if preset is None else PRESETS[preset])))
+        flat.append(dict(_flat("", PRESETS[configs[0].preset or "best"])))
     names = [name for name in flat[0] if name not in UNRELATED and len({repr(values[name]) for values in flat}) > 1]
     return [(name, [_setting(name, values[name]) for values in rows]) for name in names]
 

@@ -27,20 +27,69 @@ REMOVED = {
 RENAMED = {"relight_from": "appearance_from", "dense_fraction": "split_size"}
 """Fields that earlier versions wrote under another name."""
 
-ALWAYS = {
-    "": "antialias app assume checkpoint_every dap graph keep_checkpoints resident_bytes seed stage2 static_appearance "
-    "static_geometry vdp",
-    "densify": "every gradient max_gaussians max_size min_opacity split_size visibility",
-    "loss": "depth depth_dynamic depth_end dynamic dynamic_background joint ssim static",
-    "masks": "dilate erode holes",
-    "model": "appearance_degree appearance_opacity depth dynamic_points half max_static_points position_bands "
-    "sh_degree skip time_bands width",
-    "optim": "means networks networks_end opacities quats scales sh_dc sh_rest",
-    "schedule": "appearance_from deform_from densify_from densify_until noise_until pretrain prune_every realign_at "
-    "reset_every sh_degree_every stage1 stage2 warmup",
+FORMER: dict[str, dict[str, Any]] = {
+    "": {
+        "as_taken": False,
+        "background": "black",
+        "data": None,
+        "dataset": None,
+        "depth": True,
+        "device": None,
+        "exposure": False,
+        "factor": None,
+        "iterations": None,
+        "lpips": None,
+        "lpips_net": "vgg",
+        "max_alpha": 0.999,
+        "out": None,
+        "preset": None,
+        "resume": None,
+        "try_masks": False,
+        "undistort": True,
+        "vrig_factor": None,
+    },
+    "densify": {
+        "max_elongation": 0.0,
+        "min_pixels": 0,
+        "noise": 5e5,
+        "reseed": 0.0,
+        "strategy": "3dgs",
+        "unit": "extent",
+        "weakest": 0.0,
+    },
+    "loss": {
+        "acceleration": 0.0,
+        "branches_in_stage2": "yes",
+        "depth_gate": True,
+        "depth_margin": 0.0,
+        "depth_smooth": False,
+        "depth_tolerance": 0.0,
+        "hidden_appearance": True,
+        "mask_margin": 0.0,
+        "object_depth": False,
+        "opacity": 0.0,
+        "scale": 0.0,
+        "squared": 0.0,
+    },
+    "model": {
+        "appearance_depth": None,
+        "appearance_width": None,
+        "bound_sizes": True,
+        "deformation": "mlp",
+        "dropout": 0.0,
+        "dynamic_start": "points",
+        "min_period": 0.0,
+        "path_points": 4,
+        "paths": 1,
+        "point_colors": "capture",
+        "raw_input": True,
+        "tracks": True,
+    },
+    "optim": {"means_anneal": "run", "means_scale": None, "poses": 0.0},
+    "schedule": {"fit_motion": 0, "joint_from": None, "settle": 0},
 }
-"""Fields of each section, "" for those outside, that every version since 0.1.0 writes, but for those that may be null.
-Others may be missing. With the default of one of these, a run would be resumed as another run."""
+"""Values that runs of versions without these fields had, by section, "" for those outside. A field that is not here has
+been written by every version since 0.1.0: with a default in its place, a run would be resumed as another run."""
 
 
 def former_option(name: str) -> str:
@@ -82,61 +131,41 @@ def read_config(folder: Path) -> TrainConfig:
         raise ValueError(missing(folder))
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
-    values = _with_old_meaning(read_json(path, max_bytes=MAX_BYTES))
-    config = parse_config(values, path)
-    _require_complete(values, path)
+    config = parse_config(_with_old_meaning(read_json(path, max_bytes=MAX_BYTES)), path)
     return dataclasses.replace(config, out=folder)
 
 
-def _require_complete(values: dict[str, Any], path: Path) -> None:
-    """Raises ValueError if a section or field is missing that every version writes, instead of taking its default."""
-    for section, names in ALWAYS.items():
-        present = {RENAMED.get(name, name) for name in (values.get(section, {}) if section else values)}
-        lacking = [name for name in names.split() if name not in present]
-        if lacking:
-            is_gone = section and section not in values
-            what = f"section {section}" if is_gone else ".".join(filter(None, (section, lacking[0])))
-            raise ValueError(
-                f"{path} has no {what}, which every version writes: restore the file from a copy, because with "
-                "defaults in its place this would be another run"
-            )
-
-
 def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
-    """Values as today's version writes what an earlier one meant, so that its runs are resumed as they were begun.
+    """Values as today's version writes those of an earlier one, so that its runs are resumed as they were begun.
 
-    Before there was ``background``, it was always black; before ``densify.unit``, it was the extent. Before there was
-    ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that is gone is none:
-    the file has all of its values. ``loss.branches_in_stage2`` was a yes or no. The options of ``REMOVED`` changed
-    nothing that is still to be done, but for ``densify.depth_gradients``: terms of depth count from now on where
-    densification did not look at them.
+    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that
+    is gone is none: the file has all of its values. ``loss.branches_in_stage2`` was a yes or no. The options of
+    ``REMOVED`` changed nothing that is still to be done, but for ``densify.depth_gradients``: terms of depth count from
+    now on where densification did not look at them.
     """
-    values = {"background": "black", **values}
-    if isinstance(densify := values.get("densify"), dict):
-        values = {**values, "densify": {"unit": "extent", **densify}}
     if values.get("preset") in REMOVED_PRESETS:
         values = {**values, "preset": None}
-    for part, names in REMOVED.items():
-        if isinstance(known := values.get(part), dict):
-            values = {**values, part: {k: v for k, v in known.items() if k not in names}}
-    loss = values.get("loss")
-    if isinstance(loss, dict) and isinstance(loss.get("branches_in_stage2"), bool):
-        loss = {**loss, "branches_in_stage2": "yes" if loss["branches_in_stage2"] else "no"}
+    if isinstance(loss := values.get("loss"), dict):
+        if isinstance(branches := loss.get("branches_in_stage2"), bool):
+            loss = {**loss, "branches_in_stage2": "yes" if branches else "no"}
+        if values.get("dap") is False and "depth_gate" not in loss:
+            loss = {**loss, "depth": 0.0}
         values = {**values, "loss": loss}
-    if values.get("dap") is False and isinstance(loss, dict) and "depth_gate" not in loss:
-        return {**values, "loss": {**loss, "depth": 0.0}}
+    for section, names in REMOVED.items():
+        if isinstance(part := values.get(section), dict):
+            values = {**values, section: {name: value for name, value in part.items() if name not in names}}
     return values
 
 
 def parse_config(values: dict[str, Any], source: Path | str) -> TrainConfig:
-    """A training config from parsed JSON or TOML; fields that are not given have the defaults of ``TrainConfig``.
+    """A training config from parsed JSON or TOML; newer fields that are not given are as in ``FORMER``.
 
     Args:
         values: Fields, nested as in ``TrainConfig``.
         source: Where they come from, for messages.
 
     Raises:
-        ValueError: If there are unknown or mistyped fields, or numbers out of their range.
+        ValueError: If there are unknown, missing or mistyped fields, or numbers out of their range.
     """
     config: TrainConfig = _parse(TrainConfig, values, source)
     try:
@@ -155,6 +184,13 @@ def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
     if unknown := sorted(set(values) - set(hints)):
         close = suggestion(unknown[0], set(hints) - set(values))
         raise ValueError(f"{path} has fields of another version: {', '.join(unknown):.200}{close}")
+    values = FORMER.get(prefix.rstrip("."), {}) | values
+    if lacking := [name for name in hints if name not in values]:
+        kind = "section " if dataclasses.is_dataclass(hints[lacking[0]]) else ""
+        raise ValueError(
+            f"{path} has no {kind}{prefix}{lacking[0]}, which every version writes: restore the file from a copy, "
+            "because with defaults in its place this would be another run"
+        )
     fields = {}
     for name, value in values.items():
         hint = hints[name]

@@ -71,8 +71,7 @@ class TrainingInterrupted(KeyboardInterrupt):
 def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callback] = ()) -> Run:
     """Trains and evaluates a run.
 
-    ``train(replace(PRESETS["best"], data=Path("nerfds/as")), log=print).trained_scene()`` trains as the command line
-    does, with ``dataclasses.replace`` and ``warpgs.config.presets.PRESETS``.
+    ``train(TrainConfig(data=Path("nerfds/as")), log=print).trained_scene()`` trains as the command line does.
 
     SIGTERM and the first Ctrl-C let the current iteration finish and save a checkpoint; the second Ctrl-C stops at
     once.
@@ -81,8 +80,9 @@ def train(config: TrainConfig, log: Log | None = None, callbacks: Sequence[Callb
     evaluates; in the others, ``log`` and ``callbacks`` are not called, and ``train`` returns when training has ended.
 
     Args:
-        config: The config; ``PRESETS`` has complete ones. ``resume`` continues a run with its own config, for
-            ``iterations`` in total if that is given.
+        config: The config. Its defaults are the preset best; ``dataclasses.replace`` changes one of
+            ``warpgs.config.presets.PRESETS``. ``resume`` continues a run with its own config, for ``iterations`` in
+            total if that is given.
         log: Receives lines for the user; if None, nothing is printed.
         callbacks: Each is called with a ``Progress`` every 50 iterations and before checkpoints; if one returns true,
             training ends there, with a checkpoint. Their time does not count as training time.

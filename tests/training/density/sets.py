@@ -2,14 +2,13 @@
 
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from tests.scenes import generator
-from warpgs.config import ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.training.optimizer import make_optimizer
 
-NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
+NETWORK = plain.model(position_bands=1, time_bands=1, depth=1, width=2)
 
 
 def make_gaussians(sizes, opacities=0.8):

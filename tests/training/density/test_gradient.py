@@ -7,17 +7,16 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from tests.reference.covariance import covariance
 from tests.scenes import error, generator, make_camera, make_splats, relative_error
 from tests.training.density.sets import copies, equal, make_gaussians, make_scene, trained
-from warpgs.config import DensifyConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.training.density.gradient import GradientStrategy, Limits, densify
 from warpgs.training.logger import TrainingLogger
 
 UNIT = 2.0
-CONFIG = DensifyConfig(gradient=0.5, split_size=0.05, min_opacity=0.1, max_size=0.5)
+CONFIG = plain.densify(gradient=0.5, split_size=0.05, min_opacity=0.1, max_size=0.5)
 SMALL, LARGE = 0.09, 0.11  # around UNIT · split_size = 0.1
 HUGE, OVERSIZED = 0.9, 1.1  # around UNIT · max_size = 1
 SMALL_GRADIENT, LARGE_GRADIENT = 0.4, 0.6  # around the threshold

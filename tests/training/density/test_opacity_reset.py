@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import nn
 
-from tests import tiny
+from tests import plain, tiny
 from tests.reference.projection import project as reference
 from tests.scenes import error, generator, relative_error
 from warpgs.cameras import Camera
-from warpgs.config import ModelConfig, RenderSettings
+from warpgs.config import RenderSettings
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.ops.projection import Geometry, View
@@ -22,7 +22,7 @@ from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import make_optimizer
 from warpgs.training.schedule import Phase
 
-NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
+NETWORK = plain.model(position_bands=1, time_bands=1, depth=1, width=2)
 PHASE = Phase(
     "stage1",
     use_deformation=True,

@@ -6,11 +6,10 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from tests.reference.render import as_dict
 from tests.reference.render import render as reference
 from tests.scenes import as_gaussians, error, make_camera, make_splats
-from warpgs.config import ModelConfig
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.training.density.prune import Pruned, blend_weights, prune_invisible, remove_weakest, visibility
@@ -18,7 +17,7 @@ from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import make_optimizer
 from warpgs.training.schedule import Phase
 
-NETWORK = ModelConfig(position_bands=1, time_bands=1, depth=1, width=2)
+NETWORK = plain.model(position_bands=1, time_bands=1, depth=1, width=2)
 AHEAD = make_camera()
 OPAQUE_LOGIT = 20.0
 """Logit of an opacity that rounds to 1 in single precision."""

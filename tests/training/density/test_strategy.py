@@ -7,10 +7,10 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from tests.scenes import relative_error
 from warpgs.cameras import Camera
-from warpgs.config import DensifyConfig, RenderSettings
+from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
 from warpgs.runs import checkpoint
 from warpgs.training.density import DENSITY, make_strategy
@@ -62,7 +62,7 @@ def step(trainer):
 def test_an_unknown_strategy_is_refused_by_name():
     message = r"no density strategy '3dgz'; densify\.strategy is one of: 3dgs.*; did you mean 3dgs\?$"
     with pytest.raises(ValueError, match=message):
-        make_strategy(DensifyConfig(strategy="3dgz"))
+        make_strategy(plain.densify(strategy="3dgz"))
 
 
 def test_a_strategy_is_asked_for_the_actions_of_the_schedule_in_their_order(trainer):
@@ -149,7 +149,7 @@ def camera_at(z, focal=FOCAL, aspect=1.0):
 
 def observed(views, depths=(2.0, 4.0, 8.0)):
     """A strategy that observed views, each of which shows the Gaussians of its indices at z = ``depths`` or its own."""
-    strategy, num = Strategy(DensifyConfig()), len(depths)
+    strategy, num = Strategy(plain.densify()), len(depths)
     strategy.begin(num, torch.device("cpu"))
     for camera, shown, *moved in views:
         means = torch.zeros(num, 3)
