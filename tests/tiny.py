@@ -16,6 +16,7 @@ from torch import Tensor
 from tests import plain
 from warpgs.config import TrainConfig
 from warpgs.data.loaders import LoadOptions, load_with
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
 from warpgs.synthetic.room import BuiltinScene, builtin_capture
@@ -78,7 +79,7 @@ def write(folder: Path) -> Path:
 
 
 def trainer(data: Path, run: Path, config: TrainConfig = CONFIG) -> Trainer:
-    return Trainer(config, load_with(data, None, LoadOptions(depth=config.depth)), run)
+    return Trainer(prepare_start(config, load_with(data, None, LoadOptions(depth=config.depth))), run)
 
 
 def train(trainer: Trainer, interrupt: Interrupt | None = None) -> bool:

@@ -13,8 +13,10 @@ from tests.data import captures, layouts
 from warpgs.captures.opening import load_capture, open_capture
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.loaders import LoadOptions, load_with
 from warpgs.initialization.initialize import initial_scene
 from warpgs.initialization.point_cloud import random_points
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.training.trainer import Trainer
 
 FOLDERS = ("depth", "depths", "disp")
@@ -98,14 +100,14 @@ def test_static_gaussians_start_at_random_positions(layout, capture):
 def test_training_runs_through_all_stages(layout, capture, tmp_path):
     assume = "static" if layout == "megasam" else "masks"
     config = dataclasses.replace(tiny.CONFIG, data=capture, depth=False, assume=assume)
-    trainer = Trainer(config, open_capture(config), tmp_path / "run")
-    assert trainer.num_aligned == trainer.num_with_objects == 0
-    assert tiny.train(trainer)
+    start = prepare_start(config, open_capture(config))
+    assert start.num_aligned == start.num_with_objects == 0
+    assert tiny.train(Trainer(start, tmp_path / "run"))
 
 
 @pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
 @pytest.mark.parametrize("part", ["all frames", "the last frame"])
-def test_a_trainer_refuses_depth_that_its_config_excludes(part, resident_bytes, tmp_path):
+def test_no_start_is_prepared_from_depth_that_the_config_excludes(part, resident_bytes, tmp_path):
     capture = load_capture(tiny.write(tmp_path / "capture"))
     if part == "the last frame":
         read, last = capture.read, capture.train[-1]
@@ -118,12 +120,12 @@ def test_a_trainer_refuses_depth_that_its_config_excludes(part, resident_bytes, 
     config = dataclasses.replace(tiny.CONFIG, depth=False, resident_bytes=resident_bytes)
     remedy = r"was read with depth, but the config is without \(depth=False\); .* open_capture\(config\)"
     with pytest.raises(ValueError, match=remedy) as raised:
-        Trainer(config, capture, tmp_path / "run")
+        prepare_start(config, capture)
     assert "\n" not in str(raised.value)
 
 
-def test_a_trainer_without_depth_takes_what_has_none(tmp_path):
+def test_a_start_without_depth_is_prepared_from_captures_that_have_none(tmp_path):
     data, config = tiny.write(tmp_path / "capture"), dataclasses.replace(tiny.CONFIG, depth=False)
-    assert tiny.trainer(data, tmp_path / "run", config).num_aligned == 0
+    assert prepare_start(config, load_with(data, None, LoadOptions(depth=False))).num_aligned == 0
     shutil.rmtree(data / "depth")
-    assert Trainer(config, load_capture(data), tmp_path / "run").num_aligned == 0
+    assert prepare_start(config, load_capture(data)).num_aligned == 0

@@ -21,7 +21,7 @@ from warpgs.initialization.averaged_depth import without_rims
 from warpgs.initialization.depth_by_size import depth_by_size
 from warpgs.initialization.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth
 from warpgs.initialization.objects import MIN_VISIBLE, find_objects
-from warpgs.training.train import _describe
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.training.trainer import Trainer
 from warpgs.views.views import Views
 
@@ -538,8 +538,9 @@ def test_objects_that_few_frames_show_apart_from_others_keep_their_depth(monkeyp
 
 def test_training_uses_the_depth_of_objects_without_pretraining(tmp_path):
     capture = capture_of(MASKS)
-    trainer = Trainer(CONFIG, capture, tmp_path)
-    assert (trainer.num_aligned, trainer.num_with_objects) == (0, NUM)
+    start = prepare_start(CONFIG, capture)
+    assert (start.num_aligned, start.num_with_objects) == (0, NUM)
+    trainer = Trainer(start, tmp_path)
     assert trainer.protocol.pretrain.end == 0
     assert trainer.protocol.at(0).depth_weight > 0
     trainer._add_dynamic_gaussians()
@@ -551,14 +552,13 @@ def test_training_uses_the_depth_of_objects_without_pretraining(tmp_path):
 
 def test_a_capture_with_depth_pretrains(tmp_path):
     data = tiny.write(tmp_path / "data")
-    trainer = Trainer(CONFIG, load_capture(data), tmp_path / "run")
-    assert trainer.num_with_objects == 0
-    assert trainer.protocol.pretrain.end == tiny.SCHEDULE.pretrain
+    start = prepare_start(CONFIG, load_capture(data))
+    assert start.num_with_objects == 0
+    assert Trainer(start, tmp_path / "run").protocol.pretrain.end == tiny.SCHEDULE.pretrain
 
 
-def test_training_says_that_size_gives_depth(tmp_path):
-    lines: list[str] = []
-    _describe(Trainer(CONFIG, capture_of(MASKS), tmp_path), lines.append)
+def test_training_says_that_size_gives_depth():
+    lines = prepare_start(CONFIG, capture_of(MASKS)).notes
     assert f"the size of dynamic objects gives or corrects their depth in {NUM} of {NUM} views" in lines
     assert not any("training without depth" in line for line in lines)
 
@@ -571,28 +571,26 @@ def with_cut_off(num_whole: int) -> list[np.ndarray]:
     return [ball(1.0) if k < num_whole else ellipse(80, 110, (30.0, 30.0)) for k in range(NUM)]
 
 
-def warnings_before(capture: Capture, folder) -> list[str]:
+def warnings_before(capture: Capture) -> list[str]:
     """The warnings of a training before its first iteration."""
-    lines: list[str] = []
-    _describe(Trainer(CONFIG, capture, folder), lines.append)
-    return [line for line in lines if line.startswith("warning:")]
+    return [line for line in prepare_start(CONFIG, capture).notes if line.startswith("warning:")]
 
 
 @pytest.mark.parametrize(("num_whole", "warned"), [(0, True), (11, True), (12, False)])
-def test_training_warns_if_the_border_cuts_the_only_object_off_in_too_many_frames(tmp_path, num_whole, warned):
-    found = warnings_before(capture_of(with_cut_off(num_whole)), tmp_path)
+def test_training_warns_if_the_border_cuts_the_only_object_off_in_too_many_frames(num_whole, warned):
+    found = warnings_before(capture_of(with_cut_off(num_whole)))
     expected = f"warning: {unknown_depth(NUM - num_whole, NUM)}"
     assert found == ([expected] if warned else [])
 
 
-def test_frames_in_which_the_border_cuts_one_of_several_objects_off_are_counted_once(tmp_path):
+def test_frames_in_which_the_border_cuts_one_of_several_objects_off_are_counted_once():
     masks = [ellipse(30, 110, (20.0, 20.0)) | ellipse(120, 60 if k < 10 else 110, (20.0, 20.0)) for k in range(NUM)]
     masks[0] = ellipse(120, 60, (20.0, 20.0))
-    assert Trainer(CONFIG, capture_of(masks), tmp_path).num_cut == NUM - 1
+    assert prepare_start(CONFIG, capture_of(masks)).num_cut == NUM - 1
 
 
-def test_training_warns_if_too_few_frames_show_an_object(tmp_path):
-    assert warnings_before(capture_of([ball(1.0)] * 11), tmp_path) == [f"warning: {unknown_depth(0, 11)}"]
+def test_training_warns_if_too_few_frames_show_an_object():
+    assert warnings_before(capture_of([ball(1.0)] * 11)) == [f"warning: {unknown_depth(0, 11)}"]
 
 
 @NOT_ASKED_FOR
@@ -620,5 +618,5 @@ def test_depth_of_static_surfaces_alone_leaves_that_of_objects_unknown():
     [[BESIDE | mask for mask in with_cut_off(0)], [np.zeros((HEIGHT, WIDTH), bool)] * NUM],
     ids=["another object has a size", "nothing moves"],
 )
-def test_there_is_no_warning_where_size_gives_depth_or_nothing_moves(tmp_path, masks):
-    assert warnings_before(capture_of(masks), tmp_path) == []
+def test_there_is_no_warning_where_size_gives_depth_or_nothing_moves(masks):
+    assert warnings_before(capture_of(masks)) == []

@@ -20,12 +20,12 @@ from warpgs.export.start_camera import start_view
 from warpgs.files import write_png
 from warpgs.initialization import fitting
 from warpgs.initialization.fitting import fitted, mean_color
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.rendering import Layer
 from warpgs.runs.run import Run, open_run
 from warpgs.synthetic.balls import BallsSize, balls_capture
 from warpgs.training.command import parse
 from warpgs.training.train import make_trainer, train
-from warpgs.training.trainer import Trainer
 from warpgs.video import frames
 from warpgs.video.options import Render
 from warpgs.views.views import Views
@@ -177,10 +177,10 @@ def test_the_psnr_of_training_is_finite_where_nothing_is_wrong(run, tmp_path):
 
 
 @pytest.mark.parametrize("background", ["capture", "mean"])
-def test_a_trainer_refuses_a_background_that_was_not_looked_up(capture, tmp_path, background):
+def test_no_start_is_prepared_with_a_background_that_was_not_looked_up(capture, background):
     assert capture.background == "white"
     with pytest.raises(ValueError, match=f'background is "{background}": call fitted'):
-        Trainer(plain.config(device="cpu", background=background), capture, tmp_path)
+        prepare_start(plain.config(device="cpu", background=background), capture)
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import torch
 from tests import tiny
 from warpgs.config.presets import BEST
 from warpgs.data.loaders import LoadOptions, load_with
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.training.density import DENSITY
 from warpgs.training.trainer import Trainer
 
@@ -60,7 +61,7 @@ def moved(capture, scale, shift):
 def trained(data, folder, config, scale=1.0, shift=(0.0, 0.0, 0.0)):
     """Numbers of Gaussians after each iteration, terms of the loss, and the Gaussians in units of the view size."""
     capture = moved(load_with(data, None, LoadOptions()), scale, shift)
-    trainer, numbers, terms = Trainer(config, capture, folder), [], {}
+    trainer, numbers, terms = Trainer(prepare_start(config, capture), folder), [], {}
     trainer.callbacks = [lambda progress: terms.update(progress.status.terms)]
 
     def stop():

@@ -87,12 +87,12 @@ def test_masks_are_used_unless_none_are_clearly_better(folder, qualities, withou
 @pytest.mark.parametrize("num_whole", [MIN_FRAMES - 1, MIN_FRAMES])
 def test_unknown_depth_of_objects_is_reported_before_the_trial_is_over(folder, tmp_path, monkeypatch, num_whole):
     class Stopped(mask_trial.Trainer):
-        def __init__(self, config, capture, run):
-            super().__init__(config, capture, run)
-            self.num_cut = 3  # of the frames that are trained on
-
         def train(self, logger, interrupt):
             raise ValueError("far enough")
+
+    prepare = mask_trial.prepare_start
+    # Of the frames that are trained on.
+    monkeypatch.setattr(mask_trial, "prepare_start", lambda *of: dataclasses.replace(prepare(*of), num_cut=3))
 
     shutil.copytree(folder, tmp_path / "capture")
     whole = load_capture(folder).train[:num_whole]
@@ -173,9 +173,9 @@ def test_held_out_frames_are_not_trained_on(folder, monkeypatch):
     trained = []
 
     class Watched(mask_trial.Trainer):
-        def __init__(self, config, capture, run):
-            super().__init__(config, capture, run)
-            trained.append((config, capture.train, capture.val, run))
+        def __init__(self, start, run):
+            super().__init__(start, run)
+            trained.append((start.plan, start.capture.train, start.capture.val, run))
 
     monkeypatch.setattr(mask_trial, "Trainer", Watched)
     capture = load_capture(folder)

@@ -28,7 +28,7 @@ from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.images import read_image
 from warpgs.evaluation import evaluate_run
-from warpgs.initialization import alignment
+from warpgs.initialization import prepare_start
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
@@ -505,14 +505,14 @@ def described(data, folder, **changes):
 
 
 def test_views_without_an_alignment_do_not_count_in_the_error_of_depth(data, tmp_path, monkeypatch):
-    whole = alignment.align_to_points
+    whole = prepare_start.align_to_points
 
     def mostly_unknown(*arguments, **options):
         found = whole(*arguments, **options)
         found.alignments[1:], found.errors[1:] = torch.nan, torch.inf
         return found
 
-    monkeypatch.setattr(alignment, "align_to_points", mostly_unknown)
+    monkeypatch.setattr(prepare_start, "align_to_points", mostly_unknown)
     lines = described(data, tmp_path)
     assert any(re.match(r"depth is off by \d\.\d% ", line) for line in lines)
     assert any("depth can be aligned with the sparse points in 1 of" in line for line in lines)

@@ -14,6 +14,7 @@ from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
 from warpgs.initialization.fitting import fitted
 from warpgs.initialization.objects import find_all_objects, num_cut_off
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.runtime import ranks
 
 from .callbacks import Progress, render_and_compare
@@ -121,14 +122,14 @@ def held_out_psnr(
 
     def compare(progress: Progress) -> None:  # once training is done
         if progress.status.iteration == progress.num_iterations:
-            frames = map(progress.capture.frame, held_out)
-            values.extend(render_and_compare(progress.scene, frame)[1] for frame in frames)
+            values.extend(render_and_compare(progress.scene, progress.capture.frame(name))[1] for name in held_out)
 
     with tempfile.TemporaryDirectory(prefix="warpgs-trial-") as folder, Interrupt() as interrupt:
-        trainer = Trainer(fitted(config, capture, ignore), capture, Path(folder))
-        trainer.callbacks = [compare]
-        if trainer.num_cut is not None:
+        start = prepare_start(fitted(config, capture, ignore), capture)
+        if start.num_cut is not None:
             _warn_of_unknown_depth(whole, log)
+        trainer = Trainer(start, Path(folder))
+        trainer.callbacks = [compare]
         with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet, trainer.protocol.remaining_cost) as logger:
             finished = trainer.train(logger, interrupt)
     trainer.step.release_graphs()

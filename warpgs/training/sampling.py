@@ -1,6 +1,5 @@
 """The random choices of training: functions of the seed, the iteration, the number of rollbacks and the rank."""
 
-import hashlib
 from collections.abc import Iterator
 from itertools import count
 
@@ -8,17 +7,9 @@ import torch
 
 from warpgs.ops.dropout import MAX_SEED
 from warpgs.runtime import ranks
+from warpgs.runtime.random_numbers import random_numbers
 
 from .step import Sample
-
-
-def random_numbers(
-    seed: int, purpose: str, iteration: int, rollbacks: int, device: torch.device | str = "cpu"
-) -> torch.Generator:
-    """The generator for a purpose at an iteration, after a number of returns to a checkpoint."""
-    words = f"{seed} {purpose} {iteration} {rollbacks}"
-    digest = hashlib.blake2b(words.encode(), digest_size=7).digest()
-    return torch.Generator(device).manual_seed(int.from_bytes(digest, "big"))
 
 
 class Sampler:

@@ -11,7 +11,6 @@ from warpgs.captures.findings import Finding
 from warpgs.captures.opening import capture_folder, open_capture
 from warpgs.config import TrainConfig, scaled
 from warpgs.data.capture import Capture
-from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.loaders import describe_layout
 from warpgs.errors import command, is_out_of_memory
 from warpgs.evaluation.evaluate import check_views
@@ -19,6 +18,7 @@ from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.files import write_json
 from warpgs.initialization.fitting import fitted
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
@@ -37,8 +37,6 @@ Log = Callable[[str], None]
 """Receives lines for the user, such as ``print``."""
 
 FINISHED = "training is finished ({} iterations), and the run is evaluated again; a larger --iterations trains on"
-
-NO_DEPTH = "training without depth, and without the pretraining that needs it"
 
 
 class UnfitCaptureError(ValueError):
@@ -171,44 +169,15 @@ def _too_many(trainer: Trainer) -> str:
 
 def _describe(trainer: Trainer, log: Log) -> None:
     """Logs what is trained where."""
-    num_views, num_aligned = len(trainer.views), trainer.num_aligned
+    num_views = len(trainer.views)
     config, name = trainer.config, trainer.capture.name
     layout = "" if config.data is None else f" (read as {describe_layout(capture_folder(config.data), config.dataset)})"
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     resumed = f", after iteration {trainer.iteration} of {trainer.protocol.num_iterations}" * (trainer.iteration > 0)
     views = f"{num_views} view{'s' * (num_views != 1)}"
     log(f"{name}{layout}: {views}, on {config.device}{together}, into {trainer.run}{resumed}")
-    if (cache := trainer.views.cache) is not None:
-        read = "read from a file" if cache.fits else "decoded in every iteration: there is no space for a file"
-        log(
-            f"views of {cache.nbytes / 1e6:,.0f} MB exceed --resident-bytes or differ in size; {read} in {cache.folder}"
-        )
-    if jumps := int((trainer.gains != 1.0).any(1).sum()):
-        low, high = trainer.gains.min().item(), trainer.gains.max().item()
-        log(f"exposure jumps: {jumps} frames are divided by {low:.2f} to {high:.2f}")
-    refused = int((trainer.depth_trust.weight == 0).sum())
-    if num_aligned and trainer.protocol.phase_at(0).with_depth:
-        used = trainer.alignments.isfinite().all(1)
-        error, trust = trainer.depth_errors[used].median().item(), trainer.depth_trust.weight[used].median().item()
-        log(f"depth is off by {error:.1%} at the sparse points, its weight is {trust:.2f} (medians)")
-    if refused:
-        log(f"depth of {refused} of {num_views} views is hardly better than a constant and is not used")
-    if not config.depth:
-        log(f"depth is switched off: {NO_DEPTH}")
-    elif num_aligned < num_views - refused:
-        reason = "" if num_aligned or trainer.num_with_objects else f": {NO_DEPTH}"
-        if not num_aligned and trainer.capture.frame(trainer.capture.train[0]).inverse_depth is None:
-            made = f", which {command('prepare', config.data, '--add', 'depth')} makes" * (
-                not trainer.capture.is_builtin
-            )
-            log(f"the capture has no depth{made}{reason}")
-        else:
-            log(f"depth can be aligned with the sparse points in {num_aligned} of {num_views} views{reason}")
-    if trainer.num_with_objects:
-        changed = f"{trainer.num_with_objects} of {num_views} views"
-        log(f"the size of dynamic objects gives or corrects their depth in {changed}")
-    if trainer.num_cut is not None:
-        log(f"warning: {unknown_depth(trainer.num_cut, num_views)}")
+    for note in trainer.notes:
+        log(note)
 
 
 def _describe_corrections(poses: PoseCorrections, log: Log) -> None:
@@ -253,7 +222,7 @@ def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitSta
         log(f"the preset {config.preset} is for a GPU; {_cpu_advice(config)}")
     config, trial = with_trusted_masks(config, capture, log, quiet)
     config = fitted(config, capture, log)
-    trainer = Trainer(config, capture, Path(ranks.text_of_first(folder)))
+    trainer = Trainer(prepare_start(config, capture), Path(ranks.text_of_first(folder)))
     if ranks.is_first():
         Run.create(trainer.run, config)  # last: the folder of a run that is refused before is removed again
         if trial:
@@ -296,7 +265,7 @@ def _continued(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.Exi
     capture = check_capture(run.open_capture(quiet), run.config, log)
     _compare_ranks(run.config, capture)
     _read_evaluation_frames(capture, run.config, quiet)
-    trainer = Trainer(run.config, capture, run.folder)
+    trainer = Trainer(prepare_start(run.config, capture), run.folder)
     trainer.restore_newest(log)
     if trainer.iteration == trainer.protocol.num_iterations:
         log(FINISHED.format(trainer.iteration))

@@ -7,27 +7,22 @@ from pathlib import Path
 
 import torch
 
-from warpgs.captures.empty_masks import untrusted_masks
-from warpgs.config import TrainConfig
 from warpgs.config.presets import far_rates
-from warpgs.data.capture import Capture
 from warpgs.initialization import alignment, initialize
-from warpgs.initialization.exposure import exposure_gains
-from warpgs.initialization.object_depth import fill_object_depth
-from warpgs.model.poses import PoseCorrections
+from warpgs.initialization.start import Start
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
-from warpgs.runs.captures import known_background, require_same_times
+from warpgs.runs.captures import require_same_times
 from warpgs.runs.trained import TrainedScene
 from warpgs.runtime import ranks
-from warpgs.views.views import Views
+from warpgs.runtime.random_numbers import random_numbers
 
 from . import optimizer as optim
 from .callbacks import Callback, Progress
 from .density.adaptation import Adaptation
 from .interrupt import Interrupt
 from .logger import Status, TrainingLogger
-from .sampling import Sampler, random_numbers
+from .sampling import Sampler
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step
 
@@ -51,8 +46,7 @@ class Trainer:
     in the schedule depends on their number, as in gsplat, whose users shorten it by ``--steps_scaler``.
 
     Args:
-        config: Resolved config: schedule rescaled, device and background chosen.
-        capture: Capture to train on, as ``open_capture(config)`` reads it.
+        start: What training starts from; its views and scene are changed.
         run: Run folder, for the checkpoints.
 
     Attributes:
@@ -61,53 +55,24 @@ class Trainer:
         iteration: Iterations done.
         unit: Of learning rates of positions and of corrections of poses [scene units]: the capture's view size, or
             the one with which the run was begun.
-        gains: [T, 3] what the colours of each training frame are divided by.
-        num_aligned: Number of views whose depth could be aligned to the sparse points.
-        num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
-        num_cut: Number of views in which the border cuts dynamic objects off, if that leaves their depth unknown.
-        depth_errors: [T] median relative error of each view's aligned depth at these points; infinite if not aligned.
-        depth_trust: [T] how much each view's depth is trusted.
+        depth_trust: How much each view's depth is trusted.
+        notes: Sentences on the start.
         seconds: Training time of earlier sessions of this run [s].
         callbacks: Called after regular checks and before checkpoints, off the clock.
-
-    Raises:
-        ValueError: If a training frame has no mask, is damaged, or has depth that the config excludes, or an option has
-            an unknown value.
     """
 
-    def __init__(self, config: TrainConfig, capture: Capture, run: Path) -> None:
-        self.config, self.run = config, run
-        self.capture = capture.assuming(config.assume).over(known_background(config, capture))
-        self.device = torch.device(config.device or "cpu")
-        self.gains = exposure_gains(self.capture) if config.exposure else torch.ones(len(self.capture.train), 3).float()
-        gains = self.gains if bool((self.gains != 1.0).any()) else None  # saves steps a division
-        self.unit = self.capture.view_size
-        poses = PoseCorrections(len(self.capture.train), self.unit).to(self.device) if config.optim.poses else None
-        self.views = Views(
-            self.capture, self.device, config.resident_bytes, config.loss.mask_margin, gains, poses, config.graph
-        )
-        if config.schedule.joint_from is not None:  # otherwise nothing else is learned from these frames in stage I
-            for name in untrusted_masks(self.capture):
-                self.views.mask_trust[self.capture.train.index(name)] = 0.0
-        if not config.depth:
-            alignment.require_no_depth(self.capture, self.views)
+    def __init__(self, start: Start, run: Path) -> None:
+        self.config, self.run = start.plan, run
+        self.capture, self.views = start.capture, start.views
+        self.alignments, self.depth_trust, self.notes = start.alignments, start.trust, start.notes
+        self.device, self.unit = start.views.device, start.capture.view_size
         self.iteration, self.rollbacks = 0, 0
         self.seconds, self._started = 0.0, time.monotonic()
         self.callbacks: Sequence[Callback] = ()
         self._earlier_peak = 0
-        found = alignment.align_to_points(self.capture, self.views, smooth=config.loss.depth_smooth)
-        for tensor in found:
-            ranks.copy_first_(tensor)
-        self.depth_errors, self.depth_trust = found.errors[:, 0], found.trust(config.loss)
-        self.alignments = torch.where(self.depth_trust.weight[:, None] > 0, found.alignments, torch.nan)
-        self.num_aligned = int(self.alignments.isfinite().all(1).sum())
-        self.num_with_objects, self.num_cut = fill_object_depth(
-            config, self.capture, self.views, self.alignments, found.plain_errors
-        )
-        fits = initialize.fits_motion(config, self.capture, self.views, self.alignments)
-        self.protocol = Protocol(config, self.num_aligned + self.num_with_objects > 0, self.num_aligned > 0, fits)
-        self._sampler = Sampler(config.seed, len(self.views), config.loss.dynamic_background == "black")
-        self._start_from(initialize.initial_scene(config, self.capture, self._generator("points")))
+        self.protocol = Protocol(start.plan, start.has_depth, start.num_aligned > 0, start.fits_motion)
+        self._sampler = Sampler(self.config.seed, len(self.views), self.config.loss.dynamic_background == "black")
+        self._start_from(start.scene)
 
     def _start_from(self, scene: SplitScene) -> None:
         """Replaces the scene on all ranks by that of rank 0, with a new optimizer."""

@@ -11,9 +11,9 @@ from tests.reference.covariance import covariance
 from tests.scenes import generator, relative_error
 from tests.training.density.sets import copies, equal, make_gaussians, trained
 from warpgs.runtime import ranks
+from warpgs.runtime.random_numbers import random_numbers
 from warpgs.training.density.mcmc import add_noise
 from warpgs.training.logger import TrainingLogger
-from warpgs.training.sampling import random_numbers
 
 LOSS = dataclasses.replace(tiny.CONFIG.loss, opacity=0.01, scale=0.01)
 DENSIFY = dataclasses.replace(tiny.CONFIG.densify, strategy="mcmc", weakest=0.0)

@@ -1,0 +1,51 @@
+"""A start is what remedies make of a capture, and a trainer takes it as it is."""
+
+import dataclasses
+from unittest.mock import Mock
+
+import pytest
+import torch
+
+from tests import tiny
+from warpgs.captures.opening import load_capture
+from warpgs.initialization import prepare_start as module
+from warpgs.initialization.prepare_start import prepare_start
+from warpgs.initialization.start import Remedy
+from warpgs.training.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def capture(data):
+    return load_capture(data)
+
+
+def test_remedies_that_apply_change_the_start_in_their_order(capture, monkeypatch):
+    remedies = (
+        Remedy("first", lambda start: True, lambda start: start.noted("first")),
+        Remedy("unneeded", lambda start: "first" not in start.notes, lambda start: start.noted("unneeded")),
+        Remedy("last", lambda start: "first" in start.notes, lambda start: start.noted("last")),
+    )
+    monkeypatch.setattr(module, "REMEDIES", remedies)
+    assert prepare_start(tiny.CONFIG, capture).notes == ("first", "last")
+
+
+def test_remedies_have_names_of_their_own():
+    names = [remedy.name for remedy in module.REMEDIES]
+    assert len(set(names)) == len(names)
+
+
+def test_a_jump_of_exposure_is_divided_out_of_the_views_and_noted(capture, monkeypatch):
+    gains = torch.ones(len(capture.train), 3)
+    gains[1] = 2.0
+    monkeypatch.setattr(module, "exposure_gains", lambda capture: gains)
+    plain, evened = (prepare_start(dataclasses.replace(tiny.CONFIG, exposure=on), capture) for on in (False, True))
+    assert torch.allclose(evened.views[1].image, plain.views[1].image / 2.0, atol=1 / 255)
+    assert torch.equal(evened.views[0].image, plain.views[0].image)
+    sentence = "exposure jumps: 1 frames are divided by 1.00 to 2.00"
+    assert (sentence in evened.notes, sentence in plain.notes) == (True, False)
+
+
+def test_a_trainer_reads_no_frame_before_it_trains(capture, tmp_path):
+    start, read = prepare_start(tiny.CONFIG, capture), Mock()
+    Trainer(dataclasses.replace(start, capture=dataclasses.replace(start.capture, read=read)), tmp_path)
+    read.assert_not_called()

@@ -1,0 +1,153 @@
+"""What comes before the first step, in order: views are read, then each remedy that applies changes the start."""
+
+from dataclasses import replace
+
+import torch
+
+from warpgs.captures.empty_masks import untrusted_masks
+from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture
+from warpgs.data.dynamic_regions import unknown_depth
+from warpgs.errors import command
+from warpgs.model.poses import PoseCorrections
+from warpgs.runs.captures import known_background
+from warpgs.runtime import ranks
+from warpgs.runtime.random_numbers import random_numbers
+from warpgs.views.views import Views
+
+from .alignment import DepthTrust, align_to_points, require_no_depth
+from .exposure import exposure_gains
+from .initialize import fits_motion, initial_scene
+from .object_depth import fill_object_depth
+from .start import Remedy, Start
+
+NO_DEPTH = "training without depth, and without the pretraining that needs it"
+
+
+def prepare_start(plan: TrainConfig, capture: Capture) -> Start:
+    """What training starts from.
+
+    All ranks of torchrun must call it.
+
+    Args:
+        plan: Resolved config: schedule rescaled, device chosen, values that depend on the capture looked up
+            (``fitting.fitted``).
+        capture: Capture to train on, as ``open_capture(plan)`` reads it.
+
+    Raises:
+        ValueError: If a training frame has no mask, is damaged, or has depth that the plan excludes, or an option has
+            an unknown value.
+    """
+    start = _read(plan, capture.assuming(plan.assume).over(known_background(plan, capture)))
+    for remedy in REMEDIES:
+        if remedy.applies(start):
+            start = remedy.apply(start)
+    return start
+
+
+def _read(plan: TrainConfig, capture: Capture) -> Start:
+    """The start before any remedy but that of exposure, which is divided out where images are decoded."""
+    num, device = len(capture.train), torch.device(plan.device or "cpu")
+    gains = exposure_gains(capture) if plan.exposure else torch.ones(num, 3, dtype=torch.float32)
+    jumps = (gains != 1.0).any(1)
+    poses = PoseCorrections(num, capture.view_size).to(device) if plan.optim.poses else None
+    views = Views(
+        capture,
+        device,
+        plan.resident_bytes,
+        plan.loss.mask_margin,
+        gains if bool(jumps.any()) else None,  # saves steps a division
+        poses,
+        plan.graph,
+    )
+    start = Start(
+        plan,
+        capture,
+        views,
+        initial_scene(plan, capture, random_numbers(plan.seed, "points", 0, 0)),
+        torch.full((num, 2), torch.nan, dtype=torch.float32, device=device),
+        torch.full((num,), torch.inf, dtype=torch.float32, device=device),
+        DepthTrust(*torch.ones(2, num, dtype=torch.float32, device=device)),
+    )
+    if (cache := views.cache) is not None:
+        read = "read from a file" if cache.fits else "decoded in every iteration: there is no space for a file"
+        size = f"views of {cache.nbytes / 1e6:,.0f} MB exceed --resident-bytes or differ in size"
+        start = start.noted(f"{size}; {read} in {cache.folder}")
+    if count := int(jumps.sum()):
+        low, high = gains.min().item(), gains.max().item()
+        start = start.noted(f"exposure jumps: {count} frames are divided by {low:.2f} to {high:.2f}")
+    return start
+
+
+def _distrust_masks(start: Start) -> Start:
+    """Trusts no masks that are wrongly empty; ``warpgs check`` and the warnings of training name them."""
+    for name in untrusted_masks(start.capture):
+        start.views.mask_trust[start.capture.train.index(name)] = 0.0
+    return start
+
+
+def _align_depth(start: Start) -> Start:
+    """Aligns depth to the sparse points, and refuses depth that is hardly better than a constant."""
+    plan = start.plan
+    if not plan.depth:
+        require_no_depth(start.capture, start.views)
+    found = align_to_points(start.capture, start.views, smooth=plan.loss.depth_smooth)
+    for tensor in found:
+        ranks.copy_first_(tensor)
+    trust = found.trust(plan.loss)
+    alignments = torch.where(trust.weight[:, None] > 0, found.alignments, torch.nan)
+    used = alignments.isfinite().all(1)
+    num_aligned, refused, notes = int(used.sum()), int((trust.weight == 0).sum()), []
+    if num_aligned and plan.loss.depth > 0.0:
+        error, weight = found.errors[used, 0].median().item(), trust.weight[used].median().item()
+        notes.append(f"depth is off by {error:.1%} at the sparse points, its weight is {weight:.2f} (medians)")
+    if refused:
+        notes.append(f"depth of {refused} of {len(used)} views is hardly better than a constant and is not used")
+    start = replace(start, alignments=alignments, errors=found.plain_errors, trust=trust, num_aligned=num_aligned)
+    return start.noted(*notes)
+
+
+def _measure_objects(start: Start) -> Start:
+    """Gives or corrects the depth of dynamic objects by their size."""
+    found = fill_object_depth(start.plan, start.capture, start.views, start.alignments, start.errors)
+    start = replace(start, num_with_objects=found.num_views, num_cut=found.num_cut)
+    num, notes = len(start.views), []
+    if found.num_views:
+        changed = f"{found.num_views} of {num} views"
+        notes.append(f"the size of dynamic objects gives or corrects their depth in {changed}")
+    if found.num_cut is not None:
+        notes.append(f"warning: {unknown_depth(found.num_cut, num)}")
+    return start.noted(*notes)
+
+
+def _lacks_depth(start: Start) -> bool:
+    return not start.plan.depth or start.num_aligned < len(start.views) - int((start.trust.weight == 0).sum())
+
+
+def _do_without_depth(start: Start) -> Start:
+    """Notes which views have no depth, and what is not done then."""
+    capture, num_aligned = start.capture, start.num_aligned
+    if not start.plan.depth:
+        return start.noted(f"depth is switched off: {NO_DEPTH}")
+    reason = "" if start.has_depth else f": {NO_DEPTH}"
+    if num_aligned or capture.frame(capture.train[0]).inverse_depth is not None:
+        aligned = f"{num_aligned} of {len(start.views)} views"
+        return start.noted(f"depth can be aligned with the sparse points in {aligned}{reason}")
+    made = f", which {command('prepare', start.plan.data, '--add', 'depth')} makes" * (not capture.is_builtin)
+    return start.noted(f"the capture has no depth{made}{reason}")
+
+
+def _fit_motion(start: Start) -> Start:
+    """Has the deformation fitted to points before stage I, when depth is aligned to the rendering."""
+    return replace(start, fits_motion=True)
+
+
+REMEDIES = (
+    # Without a joint image in stage I, nothing else would be learned from frames whose masks are not trusted.
+    Remedy("empty masks", lambda start: start.plan.schedule.joint_from is not None, _distrust_masks),
+    Remedy("alignment of depth", lambda start: True, _align_depth),
+    Remedy("depth by size", lambda start: start.plan.loss.object_depth, _measure_objects),
+    Remedy("lack of depth", _lacks_depth, _do_without_depth),
+    Remedy("motion fit", lambda s: fits_motion(s.plan, s.capture, s.views, s.alignments), _fit_motion),
+)
+"""What is done before training, in this order."""

@@ -1,0 +1,72 @@
+"""What training starts from, and the form of the remedies for what a capture lacks."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor
+
+from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture
+from warpgs.model.scene import SplitScene
+from warpgs.views.views import Views
+
+from .alignment import DepthTrust
+
+
+@dataclass(frozen=True)
+class Start:
+    """What training starts from.
+
+    Attributes:
+        plan: What runs: the config, with the values that depend on the capture (``fitting.fitted``).
+        capture: The capture, with the masks and background that the plan implies.
+        views: Its training views; remedies change their depth and the trust in their masks in place.
+        scene: The initial scene.
+        alignments: [T, 2] scale and offset of each view's inverse depth; NaN where it is unknown or not trusted.
+        errors: [T] relative error of each view's depth at the sparse points, aligned by a scale and an offset alone;
+            infinite if not aligned.
+        trust: How much each view's depth is trusted.
+        num_aligned: Number of views whose depth could be aligned to the sparse points.
+        num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
+        num_cut: Number of views in which the border cuts dynamic objects off, if that leaves their depth unknown.
+        fits_motion: Whether the deformation is fitted to points before stage I.
+        notes: A sentence of each remedy on what it found or changed.
+    """
+
+    plan: TrainConfig
+    capture: Capture
+    views: Views
+    scene: SplitScene
+    alignments: Float[Tensor, "T 2"]
+    errors: Float[Tensor, " T"]
+    trust: DepthTrust
+    num_aligned: int = 0
+    num_with_objects: int = 0
+    num_cut: int | None = None
+    fits_motion: bool = False
+    notes: tuple[str, ...] = ()
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether any view has depth to compare."""
+        return self.num_aligned + self.num_with_objects > 0
+
+    def noted(self, *notes: str) -> "Start":
+        """The same, with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
+
+
+class Remedy(NamedTuple):
+    """A remedy for what a capture lacks.
+
+    Attributes:
+        name: Its name, for messages and tests.
+        applies: Whether it is asked for and of use.
+        apply: The start after it.
+    """
+
+    name: str
+    applies: Callable[[Start], bool]
+    apply: Callable[[Start], Start]
