@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests import tiny
+from warpgs.config import fields
 from warpgs.config.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.training import optimizer
@@ -139,13 +140,8 @@ RUN |= {"masks.erode", "masks.dilate", "masks.holes", "checkpoint_every", "keep_
 METHOD = Path(__file__).parents[1] / "docs" / "method.md"
 
 
-def flat(config, prefix=""):
-    values = {}
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        nested = dataclasses.is_dataclass(value)
-        values |= flat(value, f"{prefix}{field.name}.") if nested else {prefix + field.name: value}
-    return values
+def flat(config):
+    return {name: value for name, _, value in fields(config)}
 
 
 @pytest.mark.parametrize("section", PAPER)

@@ -4,6 +4,7 @@ Imports neither torch nor NumPy, so that ``--help`` is fast.
 """
 
 from .densify import DensifyConfig
+from .fields import fields
 from .loss import LossConfig
 from .masks import MaskPerturbation
 from .model import ModelConfig
@@ -22,6 +23,7 @@ __all__ = [
     "RenderSettings",
     "Schedule",
     "TrainConfig",
+    "fields",
     "scaled",
     "validate",
 ]

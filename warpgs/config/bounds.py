@@ -1,10 +1,10 @@
 """Ranges of the numbers in a config, beside its fields."""
 
-import dataclasses
 import reprlib
-import typing
 from dataclasses import dataclass
 from typing import Any
+
+from .fields import fields
 
 MAX_VALUE = 10**15
 """Maximum of every number that has no smaller one."""
@@ -34,20 +34,13 @@ class Bounds:
             raise ValueError(f"{name} must be positive, got 0")
 
 
-def check_bounds(prefix: str, config: Any) -> None:
+def check_bounds(config: Any) -> None:
     """Checks every number of a dataclass, and of those inside, against the bounds beside its field.
-
-    Args:
-        prefix: What stands before the names of its fields in messages.
-        config: The dataclass.
 
     Raises:
         ValueError: If a number is out of its range; the message names it.
     """
-    for name, hint in typing.get_type_hints(type(config), include_extras=True).items():
-        value = getattr(config, name)
-        if dataclasses.is_dataclass(value):
-            check_bounds(f"{prefix}{name}.", value)
-        elif isinstance(value, int | float):
+    for name, hint, value in fields(config):
+        if isinstance(value, int | float):
             bounds = (data for data in getattr(hint, "__metadata__", ()) if isinstance(data, Bounds))
-            next(bounds, Bounds()).check(prefix + name, value)
+            next(bounds, Bounds()).check(name, value)

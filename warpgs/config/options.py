@@ -120,7 +120,7 @@ def validate(config: TrainConfig) -> None:
     Raises:
         ValueError: If a number is out of its range; the message names it.
     """
-    check_bounds("", config)
+    check_bounds(config)
     model, schedule = config.model, config.schedule
     if not model.appearance_degree <= model.sh_degree <= 3:
         raise ValueError(

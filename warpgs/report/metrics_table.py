@@ -1,10 +1,9 @@
 """Rows of the tables that compare runs: metrics, and settings that differ."""
 
-import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from warpgs.config import TrainConfig
+from warpgs.config import TrainConfig, fields
 from warpgs.config.presets import PRESETS
 from warpgs.evaluation.metrics import METRICS
 
@@ -69,22 +68,11 @@ def formatted(name: str, value: Any) -> str:
 
 def config_rows(configs: Sequence[TrainConfig]) -> list[tuple[str, list[str]]]:
     """Settings that differ between runs; for a single run, those that differ from its preset."""
-    flat = [dict(_flat("", config)) for config in configs]
-    rows = list(flat)
-    if len(flat) == 1:
-        flat.append(dict(_flat("", PRESETS[configs[0].preset or "best"])))
+    usual = [PRESETS[configs[0].preset or "best"]] if len(configs) == 1 else []
+    flat = [{name: value for name, _, value in fields(config)} for config in (*configs, *usual)]
     names = [name for name in flat[0] if name not in UNRELATED and len({repr(values[name]) for values in flat}) > 1]
-    return [(name, [_setting(name, values[name]) for values in rows]) for name in names]
+    return [(name, [_setting(name, values[name]) for values in flat[: len(configs)]]) for name in names]
 
 
 def _setting(name: str, value: Any) -> str:
     return "builtin:room" if name == "data" and value is None else str(value)
-
-
-def _flat(prefix: str, part: Any) -> Iterator[tuple[str, Any]]:
-    for field in dataclasses.fields(part):
-        value = getattr(part, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _flat(f"{prefix}{field.name}.", value)
-        else:
-            yield prefix + field.name, value

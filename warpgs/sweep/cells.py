@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from warpgs.config import TrainConfig, scaled
+from warpgs.config import TrainConfig, fields, scaled
 from warpgs.config.builtin import is_builtin, parse_builtin
 from warpgs.config.presets import PRESETS
 from warpgs.errors import one_line, visible
@@ -201,14 +201,14 @@ def arguments(config: TrainConfig) -> list[str]:
     """Arguments of ``warpgs train`` for a config: its preset, and every option that differs from it."""
     assert config.preset is not None
     first = ["--preset", config.preset]
-    return first + [word for words in _different("", config, PRESETS[config.preset]) for word in words]
+    return [*first, *_different(config, PRESETS[config.preset])]
 
 
 def evaluation_arguments(config: TrainConfig) -> list[str]:
     """Those of the arguments that say how the run is evaluated."""
     assert config.preset is not None
     plain = dataclasses.replace(config, **{name: getattr(PRESETS[config.preset], name) for name in EVALUATION})
-    return [word for words in _different("", config, plain) for word in words]
+    return list(_different(config, plain))
 
 
 def parse_evaluation(command: str) -> tuple[dict[str, Any], list[str]]:
@@ -242,15 +242,13 @@ def as_evaluated_before(cell: Cell, command: str, given: Collection[str]) -> Cel
     return dataclasses.replace(cell, config=dataclasses.replace(cell.config, **before))
 
 
-def _different(prefix: str, config: Any, default: Any) -> Iterator[list[str]]:
-    for field in dataclasses.fields(config):
-        name, value, usual = field.name.replace("_", "-"), getattr(config, field.name), getattr(default, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _different(f"{prefix}{name}.", value, usual)
-        elif value != usual:
-            switch = f"--{prefix}{name}" if value else f"--{prefix}no-{name}"
-            words = map(str, value) if isinstance(value, tuple) else [str(value)]
-            yield [switch] if isinstance(value, bool) else [f"--{prefix}{name}", *words]
+def _different(config: TrainConfig, default: TrainConfig) -> Iterator[str]:
+    for (name, _, value), (*_, usual) in zip(fields(config), fields(default), strict=True):
+        section, dot, last = name.replace("_", "-").rpartition(".")
+        if value != usual:
+            yield f"--{section}{dot}{'no-' if value is False else ''}{last}"
+            if not isinstance(value, bool):
+                yield from map(str, value if isinstance(value, tuple) else [value])
 
 
 def finished_metrics(cell: Cell) -> dict[str, Any] | None:
