@@ -243,7 +243,7 @@ def test_a_scene_is_made_on_the_meta_device_without_the_compiler_of_torch():
         "from warpgs.config import ModelConfig\n"
         "from warpgs.model.scene import SplitScene\n"
         "with torch.device('meta'):\n"
-        "    SplitScene.empty(5, 4, plain.model())\n"
+        "    SplitScene.empty(5, 4, ModelConfig())\n"
         "print('torch._dynamo' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
