@@ -13,7 +13,7 @@ import torch
 
 from tests import tiny
 from tests.data.captures import edit_json, write_png
-from warpgs.evaluation import evaluate, evaluate_run
+from warpgs.evaluation import evaluate_run, scene_metrics
 from warpgs.runs import checkpoint
 from warpgs.training import command, losses
 from warpgs.training import train as script
@@ -44,7 +44,7 @@ def is_finite(run):
 def end_to_end(data, run, monkeypatch, capsys, **changes):
     """Output and metrics of ``train.py``."""
     monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
-    monkeypatch.setattr(evaluate, "TIMED_FRAMES", 2)
+    monkeypatch.setattr(scene_metrics, "TIMED_FRAMES", 2)
     # Without opacity resets, after which large Gaussians are removed: without depth or points they start large.
     schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=tiny.LENGTH)
     config = dataclasses.replace(tiny.CONFIG, data=data, out=run, schedule=schedule, **changes)
