@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from warpgs.data.optical_flow import even_contrast
+
 Pair = tuple[int, int]
 
 PATCH_STRIDE, NUM_REFINEMENTS = 4, 2
@@ -43,9 +45,8 @@ class Flows:
             expected: The flow from one frame to another to start from; from none if None.
         """
         self._expected = expected
-        contrast = cv2.createCLAHE(2.0, (8, 8))
         self.grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
-        self.planes = [contrast.apply(plane) for plane in self.grey]
+        self.planes = [even_contrast(plane) for plane in self.grey]
         height, width = self.planes[0].shape
         self.x, self.y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self._engines = threading.local()
