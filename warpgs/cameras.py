@@ -17,6 +17,11 @@ Point = Shaped[Tensor, "3"] | Shaped[np.ndarray, "3"] | Sequence[float]
 """Three numbers."""
 
 
+MAX_ANGLE = 30.0
+"""Maximum angle between the orientations of two cameras whose images are compared; farther apart, optical flow is no
+evidence [degrees]."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera at one time.
@@ -151,6 +156,12 @@ class Camera:
         viewmat[:3, 3] = -rotation @ position
         K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
         return Camera(viewmat, torch.tensor(K, dtype=torch.float32, device=device), width, height, time)
+
+
+def are_comparable(first: Camera, second: Camera) -> bool:
+    """Whether two cameras look in directions that are at most ``MAX_ANGLE`` apart."""
+    axes = (camera.viewmat[2, :3].double() for camera in (first, second))
+    return float(torch.dot(*axes)) >= math.cos(math.radians(MAX_ANGLE))
 
 
 def _vector(name: str, value: Point, device: torch.device) -> Float[Tensor, "3"]:

@@ -1,7 +1,5 @@
 """Regions of what moves, and what is said where nothing tells their depth."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -24,14 +22,10 @@ def frame_of(width: int, height: int, *boxes: tuple[slice, slice]) -> Frame:
 def test_regions_are_found_in_masks_of_a_maximum_side():
     frame = frame_of(2 * MAX_SIDE, 200, (slice(40, 80), slice(100, 200)), (slice(120, 122), slice(300, 302)))
     assert scaled_size(frame.camera) == (MAX_SIDE, 100)
-    (region,) = dynamic_regions(frame)  # the other one is too small
+    (region,) = dynamic_regions(frame.static_mask, frame.camera)  # the other one is too small
     expected = np.zeros((100, MAX_SIDE), bool)
     expected[20:40, 50:100] = True
     assert np.array_equal(region, expected)
-
-
-def test_a_frame_without_a_mask_has_no_regions():
-    assert dynamic_regions(dataclasses.replace(frame_of(64, 48), static_mask=None)) == []
 
 
 @pytest.mark.parametrize(
@@ -46,7 +40,8 @@ def test_a_frame_without_a_mask_has_no_regions():
     ids=["whole", "top", "bottom", "left", "right"],
 )
 def test_a_region_at_a_border_of_the_image_is_cut(rows, columns, expected):
-    (region,) = dynamic_regions(frame_of(64, 48, (rows, columns)))
+    frame = frame_of(64, 48, (rows, columns))
+    (region,) = dynamic_regions(frame.static_mask, frame.camera)
     assert is_cut(region) == expected
 
 

@@ -34,6 +34,23 @@ def test_remedies_have_names_of_their_own():
     assert len(set(names)) == len(names)
 
 
+def remedy(name):
+    (found,) = (remedy for remedy in module.REMEDIES if remedy.name == name)
+    return found
+
+
+def test_empty_masks_are_found_without_decoding_frames_again(capture):
+    start, read = prepare_start(tiny.CONFIG, capture), Mock()
+    remedy("empty masks").apply(dataclasses.replace(start, capture=dataclasses.replace(start.capture, read=read)))
+    read.assert_not_called()
+
+
+@pytest.mark.parametrize("assume", ["static", "dynamic"])
+def test_masks_that_are_not_used_are_not_doubted(capture, assume):
+    start = prepare_start(dataclasses.replace(tiny.CONFIG, assume=assume), capture)
+    assert not remedy("empty masks").applies(start)
+
+
 def test_a_jump_of_exposure_is_divided_out_of_the_views_and_noted(capture, monkeypatch):
     gains = torch.ones(len(capture.train), 3)
     gains[1] = 2.0

@@ -8,16 +8,16 @@ from pathlib import Path
 
 from warpgs.config.builtin import is_builtin
 from warpgs.data.capture import Assumption, Capture
+from warpgs.data.dynamic_regions import DynamicCounts
 from warpgs.data.loaders import describe_layout, missing_capture
 from warpgs.data.writer import REPORT
 from warpgs.files import read_json
 
 from .check_sample import Content, Sample, read_contents
 from .depth_check import check_depth
-from .empty_masks import check_empty_masks
 from .findings import Finding, Report
 from .frames_check import check_counts, check_files
-from .masks_check import DynamicCounts, are_suspect, check_dynamic_depth, check_masks
+from .masks_check import are_suspect, check_dynamic_depth, check_empty_masks, check_masks
 from .motion_check import Motion, check_motion, motions_of
 from .opening import capture_folder, load_capture
 from .points_check import check_points

@@ -6,11 +6,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.dynamic_regions import DynamicCounts, dynamic_counts
 from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import reduced_capture, reduced_frame
 from warpgs.data.sampling import evenly_spaced
 
-from .masks_check import DynamicCounts, dynamic_counts
 from .motion_check import pairs_to_compare
 
 COMPARED_SIDE = 1024
@@ -70,8 +70,10 @@ class Sample:
         frame = self._whole.frame(name)
         if name in self._wanted:
             self._frames[name] = reduced_frame(frame, self.capture.cameras[name])
-        has_mask = frame.static_mask is not None and self._whole.assumption == "masks"
-        return Content(None, frame.inverse_depth is not None, dynamic_counts(frame) if has_mask else None)
+        counts = None
+        if frame.static_mask is not None and self._whole.assumption == "masks":
+            counts = dynamic_counts(frame.static_mask, frame.camera, frame.inverse_depth)
+        return Content(None, frame.inverse_depth is not None, counts)
 
     def _read(self, name: str) -> Frame:
         if name not in self._frames:

@@ -1,12 +1,12 @@
 """Checks the masks of a capture by themselves."""
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from warpgs.data.capture import Capture, Frame
-from warpgs.data.dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, dynamic_regions, is_cut, unknown_depth
+from warpgs.data.capture import Capture
+from warpgs.data.dynamic_regions import MIN_FRAMES, MIN_KNOWN_FRACTION, DynamicCounts, unknown_depth
+from warpgs.data.empty_masks import wrongly_empty
 
 from .findings import Finding
 from .motion_check import Motion, confirm_masks
@@ -16,29 +16,6 @@ MAX_DYNAMIC_FRACTION = 0.4
 
 MAX_USABLE_FRACTION = 0.9
 """The same of masks that are inverted or hold something else, unless the images show that so much moves."""
-
-
-class DynamicCounts(NamedTuple):
-    """Numbers of dynamic regions, of those that the border cuts off, of dynamic pixels, and of those with depth.
-
-    Attributes:
-        fraction: Dynamic pixels as a fraction of all pixels of the frame.
-    """
-
-    regions: int
-    cut: int
-    pixels: int
-    fraction: float
-    with_depth: int
-
-
-def dynamic_counts(frame: Frame) -> DynamicCounts:
-    """Counts what the mask of a frame that has one marks as dynamic."""
-    assert frame.static_mask is not None
-    regions, is_dynamic = dynamic_regions(frame), ~frame.static_mask
-    with_depth = 0 if frame.inverse_depth is None else int((frame.inverse_depth.isfinite() & is_dynamic).sum())
-    pixels = int(is_dynamic.sum())
-    return DynamicCounts(len(regions), sum(map(is_cut, regions)), pixels, pixels / is_dynamic.numel(), with_depth)
 
 
 def are_suspect(masks: Sequence[DynamicCounts]) -> bool:
@@ -78,3 +55,14 @@ def check_dynamic_depth(frames: Sequence[DynamicCounts]) -> Iterator[Finding]:
     num_whole = sum(f.cut < f.regions for f in frames)
     if any(f.regions for f in frames) and num_whole < MIN_FRAMES and not is_known:
         yield Finding("warning", "depth", unknown_depth(sum(f.cut > 0 for f in frames), len(frames)))
+
+
+def check_empty_masks(capture: Capture, masks: Mapping[str, DynamicCounts]) -> Iterator[Finding]:
+    """Names the masks that are not trusted; the arguments are those of ``wrongly_empty``."""
+    if found := wrongly_empty(capture.cameras, masks):
+        text = (
+            f"{len(found)} of {len(masks)} masks mark nothing, such as that of {found[0]}, though something marked "
+            "whole just before or after cannot have left the image: they are not trusted, so of these frames training "
+            "compares only the joint image (not with the preset paper)"
+        )
+        yield Finding("warning", "masks", text)

@@ -1,17 +1,15 @@
 """Motion between two frames that their cameras do not explain, inside and outside the mask."""
 
 import itertools
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, UInt8
 
-from warpgs.cameras import Camera
+from warpgs.cameras import Camera, are_comparable
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between, grey_at, grey_levels
 from warpgs.data.sampling import evenly_spaced
@@ -30,10 +28,6 @@ MIN_PAIRS = 3
 MIN_AGREEING = 0.4
 """Minimum fraction of the textured pixels whose flow leads back: 0.05 to 0.25 between unrelated images, 0.9 between
 frames of a slow video."""
-
-MAX_ANGLE = 30.0
-"""Maximum angle between the orientations of two cameras; optical flow between views farther apart is no evidence
-[degrees]."""
 
 MAX_EPIPOLAR_DISTANCE = 3.0
 """Maximum median distance of static pixels from their epipolar lines [px]; more means that cameras and images do not
@@ -160,12 +154,6 @@ def _compare_regions(motions: Sequence[Motion]) -> _Regions | None:
     static, dynamic = both.T
     medians = (float(np.median(values)) for values in (dynamic - static, static, dynamic))
     return _Regions(float((dynamic > static).mean()), *medians)
-
-
-def are_comparable(first: Camera, second: Camera) -> bool:
-    """Whether two cameras look in directions that are at most ``MAX_ANGLE`` apart."""
-    axes = (camera.viewmat[2, :3].double() for camera in (first, second))
-    return float(torch.dot(*axes)) >= math.cos(math.radians(MAX_ANGLE))
 
 
 def _seen_from(

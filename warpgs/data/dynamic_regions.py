@@ -1,14 +1,15 @@
 """Connected regions of what moves, in masks that are scaled down."""
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from warpgs.cameras import Camera
 
-from .capture import Frame
 from .masks import connected_regions
 
 MAX_SIDE = 512
@@ -31,18 +32,40 @@ def scaled_size(camera: Camera) -> tuple[int, int]:
     return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
 
 
-def dynamic_regions(frame: Frame) -> list[Bool[np.ndarray, "h w"]]:
-    """The connected regions of a frame's scaled mask that are large enough; none without a mask."""
-    if frame.static_mask is None:
-        return []
-    dynamic = (~frame.static_mask.numpy()).astype(np.uint8)
-    dynamic = cv2.resize(dynamic, scaled_size(frame.camera), interpolation=cv2.INTER_NEAREST_EXACT)
+def dynamic_regions(static_mask: Bool[Tensor, "H W"], camera: Camera) -> list[Bool[np.ndarray, "h w"]]:
+    """The connected regions of a camera's scaled mask, on the CPU, that are large enough."""
+    dynamic = (~static_mask.numpy()).astype(np.uint8)
+    dynamic = cv2.resize(dynamic, scaled_size(camera), interpolation=cv2.INTER_NEAREST_EXACT)
     return connected_regions(dynamic > 0, math.ceil(MIN_AREA * dynamic.size))
 
 
 def is_cut(region: Bool[np.ndarray, "h w"]) -> bool:
     """Whether a region touches the image border."""
     return bool(region[[0, -1]].any() or region[:, [0, -1]].any())
+
+
+class DynamicCounts(NamedTuple):
+    """Numbers of dynamic regions, of those that the border cuts off, of dynamic pixels, and of those with depth.
+
+    Attributes:
+        fraction: Dynamic pixels as a fraction of all pixels of the frame.
+    """
+
+    regions: int
+    cut: int
+    pixels: int
+    fraction: float
+    with_depth: int
+
+
+def dynamic_counts(
+    static_mask: Bool[Tensor, "H W"], camera: Camera, inverse_depth: Float[Tensor, "H W"] | None = None
+) -> DynamicCounts:
+    """Counts what the mask of a frame marks as dynamic; all tensors are on the CPU."""
+    regions, is_dynamic = dynamic_regions(static_mask, camera), ~static_mask
+    with_depth = 0 if inverse_depth is None else int((inverse_depth.isfinite() & is_dynamic).sum())
+    pixels = int(is_dynamic.sum())
+    return DynamicCounts(len(regions), sum(map(is_cut, regions)), pixels, pixels / is_dynamic.numel(), with_depth)
 
 
 def unknown_depth(num_cut: int, num_frames: int) -> str:

@@ -89,7 +89,8 @@ class _Follower:
 
     def add(self, index: int, frame: Frame) -> None:
         """Goes on to the training frame of an index."""
-        regions, alone = dynamic_regions(frame), set()
+        mask, alone = frame.static_mask, set()
+        regions = [] if mask is None else dynamic_regions(mask, frame.camera)
         labels = np.full(scaled_size(frame.camera)[::-1], NOTHING)
         for region, candidates in zip(regions, self._candidates(regions), strict=True):
             if len(candidates) > 1 and not any(self.objects[k].is_mixture for k in candidates):

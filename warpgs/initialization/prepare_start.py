@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import torch
 
-from warpgs.captures.empty_masks import untrusted_masks
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
-from warpgs.data.dynamic_regions import unknown_depth
+from warpgs.data.dynamic_regions import dynamic_counts, unknown_depth
+from warpgs.data.empty_masks import wrongly_empty
 from warpgs.errors import command
 from warpgs.model.poses import PoseCorrections
 from warpgs.runs.captures import known_background
@@ -79,10 +79,17 @@ def _read(plan: TrainConfig, capture: Capture) -> Start:
     return start
 
 
+def _can_distrust_masks(start: Start) -> bool:
+    """Whether masks are used, and not all that is learned: without a joint image in stage I, nothing else would be."""
+    return start.capture.assumption == "masks" and start.plan.schedule.joint_from is not None
+
+
 def _distrust_masks(start: Start) -> Start:
     """Trusts no masks that are wrongly empty; ``warpgs check`` and the warnings of training name them."""
-    for name in untrusted_masks(start.capture):
-        start.views.mask_trust[start.capture.train.index(name)] = 0.0
+    names, views = start.capture.train, start.views
+    masks = {name: dynamic_counts(view.static_mask.cpu(), view.camera) for name, view in zip(names, views, strict=True)}
+    for name in wrongly_empty(start.capture.cameras, masks):
+        views.mask_trust[names.index(name)] = 0.0
     return start
 
 
@@ -143,8 +150,7 @@ def _fit_motion(start: Start) -> Start:
 
 
 REMEDIES = (
-    # Without a joint image in stage I, nothing else would be learned from frames whose masks are not trusted.
-    Remedy("empty masks", lambda start: start.plan.schedule.joint_from is not None, _distrust_masks),
+    Remedy("empty masks", _can_distrust_masks, _distrust_masks),
     Remedy("alignment of depth", lambda start: True, _align_depth),
     Remedy("depth by size", lambda start: start.plan.loss.object_depth, _measure_objects),
     Remedy("lack of depth", _lacks_depth, _do_without_depth),

@@ -7,8 +7,9 @@ import torch
 
 from tests.scenes import make_camera
 from warpgs.captures.check import quick_findings
-from warpgs.captures.empty_masks import untrusted_masks
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.dynamic_regions import dynamic_counts
+from warpgs.data.empty_masks import wrongly_empty
 
 HEIGHT, WIDTH = make_camera().height, make_camera().width
 WHOLE, CUT, SMALL, NOTHING = (5, 20, 5, 20), (5, 20, 0, 10), (5, 9, 5, 9), (0, 0, 0, 0)
@@ -29,7 +30,9 @@ def capture_of(*boxes, cameras=None):
 
 
 def untrusted(*boxes, **options):
-    return [int(name.removeprefix("frame_")) for name in untrusted_masks(capture_of(*boxes, **options))]
+    capture = capture_of(*boxes, **options)
+    masks = {f.name: dynamic_counts(f.static_mask, f.camera) for f in capture.frames(capture.train)}
+    return [int(name.removeprefix("frame_")) for name in wrongly_empty(capture.cameras, masks)]
 
 
 def test_empty_masks_between_whole_objects_are_not_trusted():
@@ -58,11 +61,6 @@ def test_cameras_that_look_elsewhere_may_not_see_what_moves():
 @pytest.mark.parametrize("boxes", [(NOTHING, NOTHING, NOTHING), (WHOLE, WHOLE, WHOLE)])
 def test_masks_that_are_all_alike_do_not_contradict_each_other(boxes):
     assert untrusted(*boxes) == []
-
-
-@pytest.mark.parametrize("assumption", ["static", "dynamic"])
-def test_masks_that_are_not_used_are_not_doubted(assumption):
-    assert untrusted_masks(capture_of(WHOLE, NOTHING).assuming(assumption)) == []
 
 
 def test_training_says_which_masks_it_does_not_trust():
