@@ -26,7 +26,7 @@ from warpgs.data import writer
 from warpgs.data.images import decode, read_image, read_mask
 from warpgs.data.lens import Lens, filling_zoom, undistort
 from warpgs.files import write_png
-from warpgs.prepare.images import resize_to_side
+from warpgs.prepare.frames.images import resize_to_side
 from warpgs.prepare.scene import FACTORS
 
 CLIPS = (

@@ -22,7 +22,7 @@ from warpgs.data.images import decode
 from warpgs.data.npz import read_npz
 from warpgs.data.ply import read_ply_points
 from warpgs.files import read_array
-from warpgs.prepare.intrinsics import read_intrinsics
+from warpgs.prepare.cameras.intrinsics import read_intrinsics
 from warpgs.report.evaluated_run import read_runs
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config, write_config

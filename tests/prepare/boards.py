@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from warpgs.data.lens import Lens
-from warpgs.prepare.cameras import Cameras
+from warpgs.prepare.cameras.recovered import Cameras
 from warpgs.prepare.scene import write_frames, write_scene
 
 SIZE = (256, 192)

@@ -18,9 +18,10 @@ from warpgs.data import images
 from warpgs.data.images import decode, read_depth
 from warpgs.data.loaders import recognize
 from warpgs.data.writer import STATE, WORK
-from warpgs.prepare import add, masks
+from warpgs.prepare import add
 from warpgs.prepare.add import AddOptions, add_parts
-from warpgs.prepare.flow import Flows
+from warpgs.prepare.frames.flow import Flows
+from warpgs.prepare.masks import methods
 from warpgs.prepare.methods import Masker
 
 COUNT = 12
@@ -53,7 +54,9 @@ def root(original, tmp_path):
 @pytest.fixture(autouse=True)
 def _red(monkeypatch):
     """A masker that finds what is red."""
-    monkeypatch.setitem(masks.MASKERS, "red", Masker(lambda frames, weights, quiet: [is_red(i) for i in frames.images]))
+    monkeypatch.setitem(
+        methods.MASKERS, "red", Masker(lambda frames, weights, quiet: [is_red(i) for i in frames.images])
+    )
 
 
 STATIC = np.full((192, 256), 255, np.uint8)

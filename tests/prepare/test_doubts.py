@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from tests.prepare import boards
 from warpgs.captures.check import check_capture
-from warpgs.prepare.cameras import Cameras
+from warpgs.prepare.cameras.posed_frames import PosedFrames
+from warpgs.prepare.cameras.recovered import Cameras
 from warpgs.prepare.doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
 from warpgs.prepare.options import Options
 from warpgs.prepare.pipeline import prepare
-from warpgs.prepare.posed_frames import PosedFrames
 
 
 def columns(*counts: int) -> list[np.ndarray]:
@@ -65,7 +65,7 @@ def test_a_focal_length_that_was_held_for_the_second_pass_is_noted(tmp_path, mon
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
     monkeypatch.setattr("warpgs.prepare.steps.off_background", lambda images, quiet: masks)
-    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", lambda *rest: masks)
+    monkeypatch.setattr("warpgs.prepare.masks.methods.find_dynamic", lambda *rest: masks)
     notes = prepare(shots, tmp_path / "made", Options(depth="none"))["notes"]
     assert held == [None, boards.FOCAL]
     ratio = boards.FOCAL / boards.SIZE[0]
@@ -97,7 +97,7 @@ def test_doubts_are_noted_and_the_check_warns_of_them(tmp_path, monkeypatch):
         "warpgs.prepare.steps.recover_cameras", lambda folder, names, *rest: boards.true_cameras(folder, names)
     )
     monkeypatch.setattr("warpgs.prepare.steps.off_background", lambda images, quiet: masks)
-    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", mark_left)
+    monkeypatch.setattr("warpgs.prepare.masks.methods.find_dynamic", mark_left)
     notes = prepare(shots, tmp_path / "made", Options(depth="none"))["notes"]
     assert len(notes) == 1
     assert "what does not move with the background" in notes[0]

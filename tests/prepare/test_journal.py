@@ -10,8 +10,8 @@ from tests.prepare import boards
 from warpgs.captures.opening import load_capture
 from warpgs.prepare import pipeline, steps
 from warpgs.prepare.add import AddOptions, add_parts
-from warpgs.prepare.matches import has_features
-from warpgs.prepare.model import read_model
+from warpgs.prepare.cameras.matches import has_features
+from warpgs.prepare.cameras.model import read_model
 from warpgs.prepare.options import Options
 
 COUNT = 10
@@ -121,7 +121,7 @@ def test_a_step_whose_result_is_lost_is_done_again_with_all_that_follow(
 def test_with_the_same_cameras_a_preparation_that_is_continued_gives_the_same_bits(
     shots, tmp_path_factory, monkeypatch, true_cameras, before
 ):
-    monkeypatch.setattr("warpgs.prepare.masks.WORKING_SIDE", boards.SIZE[0] // 2)
+    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", boards.SIZE[0] // 2)
     whole, folder = tmp_path_factory.getbasetemp() / "whole", tmp_path_factory.mktemp("continued")
     if not whole.exists():
         pipeline.prepare(shots, whole)

@@ -13,9 +13,9 @@ from tests.prepare import boards
 from warpgs.cli import main
 from warpgs.command_line.version import install_command
 from warpgs.prepare import weights
-from warpgs.prepare.depth_anything import network_size, predict
+from warpgs.prepare.depth.anything import network_size, predict
+from warpgs.prepare.masks.sam2 import choose_prompts, track
 from warpgs.prepare.networks import load, normalized
-from warpgs.prepare.sam2 import choose_prompts, track
 from warpgs.prepare.weights import DEPTH_ANYTHING, SAM2, find_weights
 
 needs_transformers = pytest.mark.skipif(find_spec("transformers") is None, reason="transformers is not installed")
@@ -177,7 +177,7 @@ def test_sam2_keeps_its_prompts_and_segments_every_frame(prompts, sam2):
 @needs_transformers
 def test_sam2_is_not_loaded_if_nothing_moves(sam2, monkeypatch):
     nothing = [np.zeros((4, 5), bool)] * 3
-    monkeypatch.setattr("warpgs.prepare.sam2.load", lambda *arguments: pytest.fail("was loaded"))
+    monkeypatch.setattr("warpgs.prepare.masks.sam2.load", lambda *arguments: pytest.fail("was loaded"))
     assert track([np.zeros((4, 5, 3), np.uint8)] * 3, nothing, sam2) == nothing
 
 
@@ -201,7 +201,7 @@ def test_a_capture_is_made_with_both_networks(sam2, depth_anything, tmp_path, ca
     folders.mkdir()
     for folder in (sam2, depth_anything):
         (folders / folder.name).symlink_to(folder)
-    monkeypatch.setattr("warpgs.prepare.masks.WORKING_SIDE", boards.SIZE[0])
+    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", boards.SIZE[0])
     shots = boards.write_folder(tmp_path / "shots", boards.record(16)[0])
     options = ["--masks", "sam2", "--depth", "anything", "--weights", str(folders)]
     assert main(["prepare", str(shots), str(tmp_path / "made"), *options]) == 0

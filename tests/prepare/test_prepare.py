@@ -17,11 +17,11 @@ from warpgs.captures.check import check_capture
 from warpgs.captures.opening import load_capture
 from warpgs.data.lens import Lens, undistort
 from warpgs.prepare import pipeline
-from warpgs.prepare.cameras import Cameras, NoCamerasError
-from warpgs.prepare.given_masks import read_dynamic
+from warpgs.prepare.cameras.recovered import Cameras, NoCamerasError
+from warpgs.prepare.cameras.sphere import points_around
 from warpgs.prepare.journal import Journal
+from warpgs.prepare.masks.given import read_dynamic
 from warpgs.prepare.options import Options, Selection
-from warpgs.prepare.sphere import points_around
 
 
 def prepare(source, root, force=False, **options):
@@ -48,7 +48,9 @@ def shots(tmp_path_factory):
 def made(shots):
     root = shots.parent / "made"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("warpgs.prepare.masks.WORKING_SIDE", boards.SIZE[0])  # enlarged, it takes four times as long
+        patch.setattr(
+            "warpgs.prepare.masks.methods.WORKING_SIDE", boards.SIZE[0]
+        )  # enlarged, it takes four times as long
         prepare(shots, root, holdout=8)
     return root
 
@@ -82,7 +84,7 @@ def test_the_moving_board_is_masked(made):
 
 
 def test_masks_of_a_camera_on_a_tripod_need_no_cameras(tmp_path, monkeypatch):
-    monkeypatch.setattr("warpgs.prepare.masks.WORKING_SIDE", 192)
+    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", 192)
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", lambda *rest: pytest.fail("COLMAP was asked"))
     images, truth = boards.record(12, path=boards.still_pose)
     report = prepare(boards.write_folder(tmp_path / "shots", images), tmp_path / "made", camera="still")
@@ -98,7 +100,7 @@ def test_masks_of_a_camera_on_a_tripod_need_no_cameras(tmp_path, monkeypatch):
 
 
 def test_a_video_in_which_nothing_seems_to_move_is_noted(tmp_path, monkeypatch):
-    monkeypatch.setattr("warpgs.prepare.masks.WORKING_SIDE", 192)
+    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", 192)
     shots = boards.write_folder(tmp_path / "shots", boards.record(12, moves=False, path=boards.still_pose)[0])
     notes = prepare(shots, tmp_path / "found", camera="still")["notes"]
     assert [note for note in notes if note.startswith("nothing seems to move: ")]
@@ -119,11 +121,11 @@ def test_what_moves_before_a_camera_that_turns_is_masked_and_depth_places_the_po
     def predict(images, weights, quiet):
         return [np.full(image.shape[:2], 3.0) + (np.arange(image.shape[1]) < 100) for image in images]
 
-    monkeypatch.setattr("warpgs.prepare.masks.WORKING_SIDE", 192)
+    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", 192)
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", turned_cameras)
-    for module in ("checks", "depth"):
+    for module in ("checks", "depth.methods"):
         monkeypatch.setattr(f"warpgs.prepare.{module}.find_weights", lambda *rest: tmp_path)
-    monkeypatch.setattr("warpgs.prepare.depth_anything.predict", predict)
+    monkeypatch.setattr("warpgs.prepare.depth.anything.predict", predict)
     images, truth = boards.record(14, path=boards.turning_pose)
     shots = boards.write_folder(tmp_path / "shots", images)
     prepare(shots, tmp_path / "made", camera="turning", depth="anything")
@@ -162,7 +164,9 @@ def test_masks_of_everything_are_refused_with_advice(shots, tmp_path, camera, me
 
 
 def test_a_camera_that_does_not_stand_still_is_refused(shots, tmp_path, monkeypatch):
-    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", lambda f, *rest: [i[..., 0] < 256 for i in f.images])
+    monkeypatch.setattr(
+        "warpgs.prepare.masks.methods.find_dynamic", lambda f, *rest: [i[..., 0] < 256 for i in f.images]
+    )
     message = "100% of the pixels seem to move: the camera is not still; try another --camera"
     with pytest.raises(ValueError, match=message):
         prepare(shots, tmp_path / "made", camera="still")
@@ -519,7 +523,9 @@ def test_cameras_of_the_first_pass_are_kept_if_masks_leave_too_little(error, sho
         return boards.true_cameras(folder, names)
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
-    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", lambda f, *rest: [i[..., 0] > 255 for i in f.images])
+    monkeypatch.setattr(
+        "warpgs.prepare.masks.methods.find_dynamic", lambda f, *rest: [i[..., 0] > 255 for i in f.images]
+    )
     if isinstance(error, NoCamerasError):
         notes = prepare(shots, tmp_path / "made", depth="none")["notes"]
         assert (
@@ -548,7 +554,7 @@ def test_if_nearly_everything_seems_to_move_the_error_suggests_masks(tmp_path, m
         return [np.ones(image.shape[:2], bool) for image in frames.images]
 
     shots = boards.write_folder(tmp_path / "shots", boards.record(10)[0])
-    monkeypatch.setattr("warpgs.prepare.masks.find_dynamic", all_dynamic)
+    monkeypatch.setattr("warpgs.prepare.masks.methods.find_dynamic", all_dynamic)
     with pytest.raises(ValueError, match=r"100% of the pixels seem to move.*--masks FOLDER"):
         prepare(shots, tmp_path / "made")
     assert shapes == {(384, 512, 3), (192, 256, 3)}  # small images are enlarged; then half of that size

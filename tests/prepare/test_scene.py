@@ -9,7 +9,7 @@ from tests.prepare import boards
 from warpgs.captures.opening import load_capture
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import recognize
-from warpgs.prepare.cameras import Cameras, pinhole_lens
+from warpgs.prepare.cameras.recovered import Cameras, pinhole_lens
 from warpgs.prepare.scene import scene_units, static_points
 
 

@@ -1,7 +1,7 @@
 """Adds what a capture lacks, with its own cameras: masks, depth, points.
 
 Frames of a capture may have lenses of their own. They are resampled to one pinhole camera, on which the methods of
-``masks`` and ``depth`` work; results are resampled to each frame as its file has it, with its distortion.
+``MASKERS`` and ``DEPTHS`` work; results are resampled to each frame as its file has it, with its distortion.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,13 +29,13 @@ from warpgs.errors import not_one_of
 from warpgs.files import read_json, write_json
 from warpgs.locks import lock_folder
 
-from .cameras import are_apart, camera_centers
+from .cameras.posed_frames import PosedFrames, pixel_rays
+from .cameras.recovered import are_apart, camera_centers
 from .checks import MIN_FOR_MOTION
 from .contact_sheet import choose_evenly, colored_depth, overlay_mask, write_contact_sheet
-from .depth import DEPTHS, MAX_SIDE, as_half
-from .images import resize_to_side
-from .masks import MASKERS, WORKING_SIDE
-from .posed_frames import PosedFrames, pixel_rays
+from .depth.methods import DEPTHS, MAX_SIDE, as_half
+from .frames.images import resize_to_side
+from .masks.methods import MASKERS, WORKING_SIDE
 from .weights import find_weights
 
 PARTS = ("masks", "depth", "points")

@@ -7,10 +7,10 @@ from warpgs.data.loaders import is_capture
 from warpgs.data.writer import check_holdout, held_out
 from warpgs.errors import command, not_one_of, similar_path, suggestion
 
-from .depth import DEPTHS
-from .frames import check_selection
-from .intrinsics import read_intrinsics
-from .masks import MASKERS
+from .cameras.intrinsics import read_intrinsics
+from .depth.methods import DEPTHS
+from .frames.take import check_selection
+from .masks.methods import MASKERS
 from .options import Options
 from .weights import find_weights
 

@@ -49,7 +49,7 @@ def _check_alone(options: Prepare) -> None:
 def run_sample(options: Sample) -> None:
     """Writes the video and says how to go on; raises as ``write_sample``."""
     with ending_at_once():
-        from .sample import write_sample  # imports torch and Warp
+        from .frames.sample import write_sample  # imports torch and Warp
     log = None if options.quiet else show
     write_sample(options.video, log=log)
     if log is not None:

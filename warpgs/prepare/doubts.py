@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool
 
-from .cameras import PLAUSIBLE_FOCAL, Cameras
-from .flow import Flows
-from .flow_depth import MAX_RESIDUAL
-from .images import brighten
-from .parallel import map_frames
-from .posed_frames import PosedFrames
-from .triangulation import triangulate
+from .cameras.posed_frames import PosedFrames
+from .cameras.recovered import PLAUSIBLE_FOCAL, Cameras
+from .cameras.triangulation import triangulate
+from .depth.flow import MAX_RESIDUAL
+from .frames.flow import Flows
+from .frames.images import brighten
+from .frames.parallel import map_frames
 
 DOUBTFUL_FRACTION = 0.4
 """Fraction of dynamic pixels above which the masks are probably wrong."""
@@ -42,7 +42,7 @@ def doubts_of_masks(dynamic: Planes, estimated: bool, off: Planes | None = None)
     Args:
         dynamic: [H, W] dynamic mask of each frame.
         estimated: Whether they are estimates.
-        off: [H, W] what does not move with the background of each frame (``background_motion``); None if unknown.
+        off: [H, W] what does not move with the background of each frame (``masks.background``); None if unknown.
     """
     fractions = np.array([mask.mean() for mask in dynamic])
     mean, crowded = float(fractions.mean()), int((fractions > CROWDED_FRACTION).sum())

@@ -1,4 +1,4 @@
-"""What a method for masks or depth provides; the methods themselves are listed in ``masks`` and ``depth``."""
+"""What a method for masks or depth provides; the methods themselves are in ``MASKERS`` and ``DEPTHS``."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .posed_frames import PosedFrames
+from .cameras.posed_frames import PosedFrames
 from .weights import Network
 
 DynamicMasks = Sequence[Bool[np.ndarray, "H W"]]

@@ -10,11 +10,11 @@ from warpgs.errors import command
 from warpgs.files import kept_if_used, read_json
 from warpgs.locks import lock_folder
 
-from .cameras import MISLED, Cameras, NoCamerasError
+from .cameras.recovered import MISLED, Cameras, NoCamerasError
 from .checks import check_options
 from .doubts import DOUBTFUL_FRACTION
 from .journal import Journal, first_lost
-from .masks import MASKERS, Masks
+from .masks.methods import MASKERS, Masks
 from .options import Options
 from .scene import capture_files
 from .steps import Steps, take

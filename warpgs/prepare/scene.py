@@ -13,11 +13,11 @@ from warpgs.data import writer
 from warpgs.data.lens import undistort
 from warpgs.data.units import depth_range, scene_units
 
-from .cameras import Cameras
+from .cameras.recovered import Cameras
+from .cameras.sphere import points_around
 from .contact_sheet import choose_evenly, overlay_mask, write_contact_sheet
-from .frames import Frames
-from .images import brighten, read_images
-from .sphere import points_around
+from .frames.images import brighten, read_images
+from .frames.take import Frames
 
 FACTORS = (1, 2)
 """Downscaling factors of the images and masks; training uses the second with ``--factor 2``."""

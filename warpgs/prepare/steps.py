@@ -11,21 +11,21 @@ import numpy as np
 
 from warpgs.data.lens import Lens
 
-from .background_motion import SIDE, off_background
-from .cameras import Cameras, NoCamerasError
+from .cameras.intrinsics import read_intrinsics
+from .cameras.posed_frames import load_posed_frames
+from .cameras.recovered import Cameras, NoCamerasError
+from .cameras.sfm import Settings, recover_cameras
 from .checks import check_count
-from .depth import DEPTHS, add_depth, depth_files
+from .depth.methods import DEPTHS, add_depth, depth_files
 from .doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
-from .frames import Frames, take_frames
-from .given_masks import find_given_masks, read_dynamic
-from .images import read_images, resize_to_side
-from .intrinsics import read_intrinsics
+from .frames.images import read_images, resize_to_side
+from .frames.take import Frames, take_frames
 from .journal import Journal
-from .masks import MASKERS, WORKING_SIDE, Masks, find_masks, mask_files, write_masks
+from .masks.background import SIDE, off_background
+from .masks.given import find_given_masks, read_dynamic
+from .masks.methods import MASKERS, WORKING_SIDE, Masks, find_masks, mask_files, write_masks
 from .options import Options
-from .posed_frames import load_posed_frames
 from .scene import capture_files, write_capture
-from .sfm import Settings, recover_cameras
 
 MIN_SPACE = 100
 """Disk space that is required before any frame is taken [MB]."""

@@ -1,0 +1,145 @@
+"""A job for COLMAP, and the features and matches of its frames."""
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2  # noqa: F401  before pycolmap, see ``colmap``
+import pycolmap
+
+from .matches import has_features, keep_static, sequence_pairs
+from .recovered import NoCamerasError
+
+MAX_FEATURES = 2048
+"""Maximum number of features per frame, of which COLMAP keeps the coarsest; matching takes the square of its time. Of
+120 frames of 960×540, the first pass took 116 s instead of 174 with 4,096, with 0.50 instead of 0.48 px."""
+
+WEAK_PEAK = 0.002
+"""Minimum contrast of weak features; COLMAP's default is 0.0067."""
+
+MIN_FEATURES = 60
+"""Minimum number of features per frame; with fewer, the frames lack texture."""
+
+FISHEYE, FISHEYE_FOCAL = "OPENCV_FISHEYE", 0.5
+"""The model of fisheye lenses, and the focal length over the longer side that it starts from: 115° across."""
+
+CHUNK = 16
+"""Number of frames whose features are extracted, or that are matched with others, between two reports."""
+
+Report = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do.
+
+    Attributes:
+        folder: Folder of the frames <name>.png.
+        names: Names of the frames.
+        work: Folder for the database and the reconstruction.
+        lens: COLMAP's lens model.
+        params: Its known parameters, which are kept; None to find them.
+        turns: Whether the camera only turns.
+        masks: Folder of masks <name>.png.png, 0 = dynamic.
+        thorough: Whether to match frames far apart in time that see the same points, and to refine with them.
+        weak_features: Whether to use features of low contrast.
+        focal: Known focal length [px], which is kept; None to find it.
+        refine: Whether to refine the reconstruction in the work folder instead of mapping from nothing, unless that
+            shows that it was misled.
+    """
+
+    folder: str
+    names: list[str]
+    work: str
+    lens: str
+    masks: str | None
+    thorough: bool
+    weak_features: bool
+    focal: float | None
+    refine: bool
+    params: list[float] | None = None
+    turns: bool = False
+
+    @property
+    def database(self) -> Path:
+        """Database of all features and matches."""
+        return Path(self.work) / ("weak.db" if self.weak_features else "features.db")
+
+    @property
+    def finds_focal(self) -> bool:
+        """Whether the focal length is unknown."""
+        return self.focal is None and self.params is None
+
+    @property
+    def guesses_focal(self) -> bool:
+        """Whether the focal length is unknown and starts from that of a normal lens."""
+        return self.finds_focal and self.lens != FISHEYE
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the images."""
+        return [f"{name}.png" for name in self.names]
+
+
+def extract_and_match(job: Job, report: Report) -> None:
+    """Features and matches along the sequence, unless they are in the database."""
+    finished = job.database.with_suffix(".done")
+    if finished.exists() and has_features(job.database, job.files):
+        return
+    finished.unlink(missing_ok=True)
+    job.database.unlink(missing_ok=True)
+    reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reading.camera_model = job.lens
+    if (params := _starting_parameters(job)) is not None:
+        reading.camera_params = ",".join(map(str, params))
+    extraction.sift.max_num_features = MAX_FEATURES
+    extraction.sift.max_num_orientations = 1
+    if job.weak_features:
+        extraction.sift.peak_threshold = WEAK_PEAK
+    files, single = job.files, pycolmap.CameraMode.SINGLE
+    for start in range(0, len(files), CHUNK):
+        report("features", start, len(files))
+        chunk = files[start : start + CHUNK]
+        pycolmap.extract_features(job.database, job.folder, chunk, single, reading, extraction, pycolmap.Device.cpu)
+        reading.existing_camera_id = 1
+    match(job, sequence_pairs(len(files)), report)
+    finished.touch()
+
+
+def _starting_parameters(job: Job) -> list[float] | None:
+    """Parameters of the lens that are known, or that a fisheye lens starts from; None for COLMAP's own guess."""
+    if job.params is not None or (job.focal is None and job.lens != FISHEYE):
+        return job.params
+    first = pycolmap.Bitmap.read(Path(job.folder) / job.files[0], False)
+    focal = job.focal or FISHEYE_FOCAL * max(first.width, first.height)
+    return list(pycolmap.Camera.create_from_model_name(1, job.lens, focal, first.width, first.height).params)
+
+
+def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
+    """Matches the features of pairs of frames; those that are in the database already are skipped by COLMAP."""
+    listed = job.database.with_suffix(".pairs.txt")
+    options = pycolmap.ImportedPairingOptions()
+    options.match_list_path = listed
+    step = max(1, len(pairs) * CHUNK // max(len(job.names), 1))
+    for start in range(0, len(pairs), step):
+        report("matches", start, len(pairs))
+        lines = [f"{job.files[a]} {job.files[b]}\n" for a, b in pairs[start : start + step]]
+        listed.write_text("".join(lines), "utf-8")
+        pycolmap.match_image_pairs(job.database, pairing_options=options, device=pycolmap.Device.cpu)
+
+
+def static_database(job: Job) -> Path:
+    """A copy of the database with the matches in static regions of the job's frames."""
+    database = job.database.with_suffix(".static.db")
+    shutil.copyfile(job.database, database)
+    features = keep_static(database, None if job.masks is None else Path(job.masks), job.files)
+    if features < MIN_FEATURES:
+        where, remedy = "", "record textured objects, in more light"
+        if job.masks is not None:
+            where, remedy = " in static regions", f"{remedy}, or check the masks, in which 0 must mean dynamic"
+        raise NoCamerasError(
+            f"the frames have hardly any texture{where}: {features:.0f} features per frame, at least {MIN_FEATURES} "
+            f"are needed; {remedy}"
+        )
+    return database

@@ -1,0 +1,1 @@
+"""Inverse depth of every frame."""

@@ -1,0 +1,50 @@
+"""Masks given by the user: a folder of PNG files, 0 = dynamic.
+
+Masks named like the source's files belong to these. Masks named like a capture's frames were drawn over the frames of a
+capture, which are undistorted.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from warpgs.data.loaders.listed import find_file
+from warpgs.data.resized import read_resized_mask
+
+from ..frames.take import SourceFrame
+
+SUFFIXES = (".png", ".png.png")
+"""Suffixes of mask files; captures use the second."""
+
+
+def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> tuple[list[Path], bool]:
+    """The mask of every frame, and whether they are named like the capture's frames. All must be named the same way.
+
+    Raises:
+        ValueError: If one is missing.
+    """
+
+    def find(*stems: str) -> Path | None:
+        return next((path for stem in stems if (path := find_file(folder, stem, SUFFIXES))), None)
+
+    as_source = [find(Path(frame.source).stem, frame.source) for frame in frames]
+    as_frames = [find(frame.name) for frame in frames]
+    found = min(as_source, as_frames, key=lambda paths: paths.count(None))
+    if None in found:
+        frame = frames[found.index(None)]
+        name = frame.name if found is as_frames else Path(frame.source).stem
+        raise ValueError(f"{folder} has no mask for {frame.name} ({frame.source}): expected {name}.png")
+    return [path for path in found if path is not None], found is as_frames
+
+
+def read_dynamic(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """[H, W] true where a mask file is dynamic, resized to ``size`` (width, height).
+
+    A pixel of a reduced mask is dynamic if any part of it is.
+
+    Raises:
+        ValueError: If it is damaged or its aspect ratio is not that of the frame.
+    """
+    return ~read_resized_mask(path, size)
