@@ -22,7 +22,7 @@ from warpgs.prepare import add
 from warpgs.prepare.add import AddOptions, add_parts
 from warpgs.prepare.frames.flow import Flows
 from warpgs.prepare.masks import methods
-from warpgs.prepare.methods import Masker
+from warpgs.prepare.masks.masker import Masker
 
 COUNT = 12
 NAMES = [f"shot{k:03d}" for k in range(COUNT)]

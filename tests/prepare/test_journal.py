@@ -121,7 +121,7 @@ def test_a_step_whose_result_is_lost_is_done_again_with_all_that_follow(
 def test_with_the_same_cameras_a_preparation_that_is_continued_gives_the_same_bits(
     shots, tmp_path_factory, monkeypatch, true_cameras, before
 ):
-    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", boards.SIZE[0] // 2)
+    monkeypatch.setattr("warpgs.prepare.masks.masker.WORKING_SIDE", boards.SIZE[0] // 2)
     whole, folder = tmp_path_factory.getbasetemp() / "whole", tmp_path_factory.mktemp("continued")
     if not whole.exists():
         pipeline.prepare(shots, whole)

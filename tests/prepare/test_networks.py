@@ -201,7 +201,7 @@ def test_a_capture_is_made_with_both_networks(sam2, depth_anything, tmp_path, ca
     folders.mkdir()
     for folder in (sam2, depth_anything):
         (folders / folder.name).symlink_to(folder)
-    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", boards.SIZE[0])
+    monkeypatch.setattr("warpgs.prepare.masks.masker.WORKING_SIDE", boards.SIZE[0])
     shots = boards.write_folder(tmp_path / "shots", boards.record(16)[0])
     options = ["--masks", "sam2", "--depth", "anything", "--weights", str(folders)]
     assert main(["prepare", str(shots), str(tmp_path / "made"), *options]) == 0

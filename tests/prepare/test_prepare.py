@@ -49,7 +49,7 @@ def made(shots):
     root = shots.parent / "made"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "warpgs.prepare.masks.methods.WORKING_SIDE", boards.SIZE[0]
+            "warpgs.prepare.masks.masker.WORKING_SIDE", boards.SIZE[0]
         )  # enlarged, it takes four times as long
         prepare(shots, root, holdout=8)
     return root
@@ -84,7 +84,7 @@ def test_the_moving_board_is_masked(made):
 
 
 def test_masks_of_a_camera_on_a_tripod_need_no_cameras(tmp_path, monkeypatch):
-    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", 192)
+    monkeypatch.setattr("warpgs.prepare.masks.masker.WORKING_SIDE", 192)
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", lambda *rest: pytest.fail("COLMAP was asked"))
     images, truth = boards.record(12, path=boards.still_pose)
     report = prepare(boards.write_folder(tmp_path / "shots", images), tmp_path / "made", camera="still")
@@ -100,7 +100,7 @@ def test_masks_of_a_camera_on_a_tripod_need_no_cameras(tmp_path, monkeypatch):
 
 
 def test_a_video_in_which_nothing_seems_to_move_is_noted(tmp_path, monkeypatch):
-    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", 192)
+    monkeypatch.setattr("warpgs.prepare.masks.masker.WORKING_SIDE", 192)
     shots = boards.write_folder(tmp_path / "shots", boards.record(12, moves=False, path=boards.still_pose)[0])
     notes = prepare(shots, tmp_path / "found", camera="still")["notes"]
     assert [note for note in notes if note.startswith("nothing seems to move: ")]
@@ -121,9 +121,9 @@ def test_what_moves_before_a_camera_that_turns_is_masked_and_depth_places_the_po
     def predict(images, weights, quiet):
         return [np.full(image.shape[:2], 3.0) + (np.arange(image.shape[1]) < 100) for image in images]
 
-    monkeypatch.setattr("warpgs.prepare.masks.methods.WORKING_SIDE", 192)
+    monkeypatch.setattr("warpgs.prepare.masks.masker.WORKING_SIDE", 192)
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", turned_cameras)
-    for module in ("checks", "depth.methods"):
+    for module in ("checks", "depth.estimate"):
         monkeypatch.setattr(f"warpgs.prepare.{module}.find_weights", lambda *rest: tmp_path)
     monkeypatch.setattr("warpgs.prepare.depth.anything.predict", predict)
     images, truth = boards.record(14, path=boards.turning_pose)

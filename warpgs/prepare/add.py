@@ -33,9 +33,11 @@ from .cameras.posed_frames import PosedFrames, pixel_rays
 from .cameras.recovered import are_apart, camera_centers
 from .checks import MIN_FOR_MOTION
 from .contact_sheet import choose_evenly, colored_depth, overlay_mask, write_contact_sheet
-from .depth.methods import DEPTHS, MAX_SIDE, as_half
+from .depth.estimate import MAX_SIDE, as_half
+from .depth.methods import DEPTHS
 from .frames.images import resize_to_side
-from .masks.methods import MASKERS, WORKING_SIDE
+from .masks.masker import WORKING_SIDE
+from .masks.methods import MASKERS
 from .weights import find_weights
 
 PARTS = ("masks", "depth", "points")

@@ -14,7 +14,8 @@ from .cameras.recovered import MISLED, Cameras, NoCamerasError
 from .checks import check_options
 from .doubts import DOUBTFUL_FRACTION
 from .journal import Journal, first_lost
-from .masks.methods import MASKERS, Masks
+from .masks.files import Masks
+from .masks.methods import MASKERS
 from .options import Options
 from .scene import capture_files
 from .steps import Steps, take

@@ -16,14 +16,17 @@ from .cameras.posed_frames import load_posed_frames
 from .cameras.recovered import Cameras, NoCamerasError
 from .cameras.sfm import Settings, recover_cameras
 from .checks import check_count
-from .depth.methods import DEPTHS, add_depth, depth_files
+from .depth.estimate import add_depth, depth_files
+from .depth.methods import DEPTHS
 from .doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
 from .frames.images import read_images, resize_to_side
 from .frames.take import Frames, take_frames
 from .journal import Journal
 from .masks.background import SIDE, off_background
+from .masks.files import Masks, mask_files, write_masks
 from .masks.given import find_given_masks, read_dynamic
-from .masks.methods import MASKERS, WORKING_SIDE, Masks, find_masks, mask_files, write_masks
+from .masks.masker import WORKING_SIDE, find_masks
+from .masks.methods import MASKERS
 from .options import Options
 from .scene import capture_files, write_capture
 

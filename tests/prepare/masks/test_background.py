@@ -10,7 +10,7 @@ from tests.prepare import boards
 from warpgs.prepare.cameras.recovered import Cameras, NoCamerasError
 from warpgs.prepare.frames.images import resize_to_side
 from warpgs.prepare.masks.background import SIDE, off_background
-from warpgs.prepare.masks.methods import Masks
+from warpgs.prepare.masks.files import Masks
 from warpgs.prepare.options import Options
 from warpgs.prepare.steps import Steps
 

@@ -8,15 +8,14 @@ from tests.prepare import boards
 from warpgs.data.writer import write_depth
 from warpgs.prepare.cameras.posed_frames import PosedFrames
 from warpgs.prepare.cameras.triangulation import Observation, fill_unknown, triangulate
+from warpgs.prepare.depth.estimate import DepthMethod, add_depth, as_half
 from warpgs.prepare.depth.flow import _enlarged, static_depth
-from warpgs.prepare.depth.methods import add_depth, as_half
 from warpgs.prepare.frames.flow import Flows
 from warpgs.prepare.frames.images import brighten
 from warpgs.prepare.masks import motion
 from warpgs.prepare.masks.motion import clean, confirmed, find_dynamic, gather, outline, vote
 from warpgs.prepare.masks.revisits import MIN_GAPS, Agreement, Evidence, Revisits
 from warpgs.prepare.masks.segments import Graph, Segments, segment
-from warpgs.prepare.methods import DepthMethod
 
 
 @pytest.fixture(scope="module")

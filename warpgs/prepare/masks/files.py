@@ -1,0 +1,73 @@
+"""The files that a preparation keeps its masks in."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from warpgs.data.images import read_mask
+from warpgs.data.lens import undistort
+from warpgs.files import read_json, write_json, write_png
+
+from ..cameras.recovered import Cameras
+
+INDEX = "masks.json"
+"""Index of the masks in their folder, with ``dynamic_fraction`` and ``undistorted``."""
+
+
+@dataclass(frozen=True)
+class Masks:
+    """Masks of all frames, in files <folder>/<name>.png.png with 0 = dynamic, as COLMAP reads them.
+
+    Attributes:
+        folder: Folder of the files; None if nothing is dynamic.
+        dynamic_fraction: Fraction of the pixels that are dynamic.
+        undistorted: Whether the masks belong to undistorted frames. COLMAP uses them with the frames all the same:
+            features a few pixels from the outlines do no harm.
+        estimated: Whether a method of ``MASKERS`` found them, instead of the user giving them.
+    """
+
+    folder: Path | None = None
+    dynamic_fraction: float = 0.0
+    undistorted: bool = False
+    estimated: bool = False
+
+    @staticmethod
+    def load(folder: Path) -> "Masks":
+        """The masks that ``write_masks`` wrote."""
+        index = read_json(folder / INDEX)
+        return Masks(folder, float(index["dynamic_fraction"]), bool(index["undistorted"]))
+
+    def read_dynamic(self, cameras: Cameras) -> list[Bool[np.ndarray, "H W"]]:
+        """[H, W] the dynamic mask of each undistorted frame of the cameras, in the size of the lens.
+
+        Raises:
+            ValueError: If a file was damaged since it was written.
+        """
+        lens, size = cameras.lens, (cameras.lens.width, cameras.lens.height)
+        if self.folder is None:
+            return [np.zeros(size[::-1], bool) for _ in cameras.names]
+        masks = (~read_mask(self.folder / f"{name}.png.png", size) for name in cameras.names)
+        return [mask if self.undistorted else undistort(mask, lens) for mask in masks]
+
+
+def mask_files(folder: Path, names: Sequence[str]) -> list[Path]:
+    """The files that ``write_masks`` writes."""
+    return [folder / INDEX, *(folder / f"{name}.png.png" for name in names)]
+
+
+def write_masks(
+    folder: Path, names: Sequence[str], dynamic: Sequence[Bool[np.ndarray, "H W"]], undistorted: bool = False
+) -> str:
+    """Writes the masks of the frames; returns a summary.
+
+    Raises:
+        OSError: If a file cannot be written; the message names it.
+    """
+    for name, mask in zip(names, dynamic, strict=True):
+        write_png(folder / f"{name}.png.png", (~mask).astype(np.uint8) * 255)
+    fraction = float(np.mean([mask.mean() for mask in dynamic]))
+    write_json(folder / INDEX, {"dynamic_fraction": fraction, "undistorted": undistorted})
+    return f"{fraction:.1%} of the pixels move"
