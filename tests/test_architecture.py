@@ -35,6 +35,17 @@ ORDER = [
 ]
 """The layers of the package: each may import from its own line and from those above it."""
 
+PREPARE_ORDER = [
+    "options weights networks contact_sheet",
+    "frames",
+    "cameras",
+    "masks",
+    "scene",
+    "depth",
+    "doubts checks journal steps add pipeline command",
+]
+"""The layers of ``warpgs/prepare/``, its four subjects among them."""
+
 MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 40
 """Kernels apart."""
@@ -63,28 +74,38 @@ def imports(path: Path) -> list[str]:
     return names
 
 
-def layer(parts: list[str]) -> int | None:
-    if len(parts) < 2:
-        return None
-    return next((k for k, names in enumerate(ORDER) if parts[1] in names.split()), None)
+ORDERS = {"warpgs": ORDER, "warpgs.prepare": PREPARE_ORDER}
+PACKAGES = pytest.mark.parametrize("package", ORDERS)
 
 
-def test_every_module_belongs_to_a_layer():
-    assert FILES
-    assert [
-        str(p) for p in FILES if p.name not in ("__init__.py", "__main__.py") and layer(module_name(p)) is None
-    ] == []
+def layer(package: str, name: str) -> int | None:
+    """The line of the package's order that a name in it belongs to."""
+    inside = name.removeprefix(f"{package}.").split(".")[0]
+    return next((k for k, names in enumerate(ORDERS[package]) if inside in names.split()), None)
 
 
-@PATHS
-def test_a_module_imports_only_from_its_layer_and_lower_ones(path):
-    own = layer(module_name(path))
-    for name in imports(path):
-        parts = name.split(".")
-        if parts[0] == "warpgs" and own is not None:
-            found = layer(parts)
-            assert found is not None, name
-            assert found <= own, name
+def names_in(package: str) -> dict[str, Path]:
+    """The modules in a package, by their names."""
+    files = [p for p in FILES if p.name not in ("__init__.py", "__main__.py")]
+    named = {".".join(module_name(p)): p for p in files}
+    return {name: p for name, p in named.items() if name.startswith(f"{package}.")}
+
+
+@PACKAGES
+def test_every_module_belongs_to_a_layer(package):
+    names = names_in(package)
+    assert names
+    assert [name for name in names if layer(package, name) is None] == []
+
+
+@PACKAGES
+def test_a_module_imports_only_from_its_layer_and_lower_ones(package):
+    for name, path in names_in(package).items():
+        for other in imports(path):
+            if f"{other}.".startswith(f"{package}."):
+                found = layer(package, other)
+                assert found is not None, (name, other)
+                assert found <= layer(package, name), (name, other)
 
 
 MODULES = {".".join(module_name(path)).removesuffix(".__init__"): path for path in FILES}
