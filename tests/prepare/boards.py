@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from warpgs.data.lens import Lens
+from warpgs.prepare.cameras.posed_frames import PosedFrames
 from warpgs.prepare.cameras.recovered import Cameras
 from warpgs.prepare.scene import write_frames, write_scene
 
@@ -196,3 +197,8 @@ def write_video(path: Path, images: list[np.ndarray], rate: float = 10.0) -> Pat
         writer.write(image[..., ::-1])
     writer.release()
     return path
+
+
+def posed(images):
+    """Frames with their true cameras."""
+    return PosedFrames(images, lens(), poses(len(images)), points())

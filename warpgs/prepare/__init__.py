@@ -1,1 +1,1 @@
-"""From a video of one's own to a capture: frames, cameras, masks, depth; and the check of any capture."""
+"""From a video or a folder of frames to a capture: frames, cameras, masks, depth."""

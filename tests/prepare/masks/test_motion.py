@@ -1,119 +1,17 @@
-"""Optical flow, triangulation, masks and depth of a video with known cameras."""
+"""Masks of a video with known cameras: evidence of motion, superpixels, far frames, outlines."""
 
 import cv2
 import numpy as np
 import pytest
 
 from tests.prepare import boards
-from warpgs.data.writer import write_depth
-from warpgs.prepare.cameras.posed_frames import PosedFrames
-from warpgs.prepare.cameras.triangulation import Observation, fill_unknown, triangulate
-from warpgs.prepare.depth.estimate import DepthMethod, add_depth, as_half
-from warpgs.prepare.depth.flow import _enlarged, static_depth
+from warpgs.prepare.depth.flow import static_depth
 from warpgs.prepare.frames.flow import Flows
 from warpgs.prepare.frames.images import brighten
 from warpgs.prepare.masks import motion
 from warpgs.prepare.masks.motion import clean, confirmed, find_dynamic, gather, outline, vote
 from warpgs.prepare.masks.revisits import MIN_GAPS, Agreement, Evidence, Revisits
 from warpgs.prepare.masks.segments import Graph, Segments, segment
-
-
-@pytest.fixture(scope="module")
-def video():
-    return boards.record(24)
-
-
-def posed(images):
-    """Frames with their true cameras."""
-    return PosedFrames(images, boards.lens(), boards.poses(len(images)), boards.points())
-
-
-@pytest.fixture(scope="module")
-def frames(video):
-    return posed(video[0])
-
-
-def observation(rho: float, rotation: np.ndarray, translation: np.ndarray) -> Observation:
-    ray = np.array([0.1, -0.2, 1.0], np.float32)
-    rotated = (rotation @ ray).astype(np.float32)
-    point = rotated + rho * translation
-    position = np.broadcast_to((point[:2] / point[2])[:, None, None], (2, 1, 1)).astype(np.float32)
-    return Observation(position, rotated[:, None, None], translation.astype(np.float32), np.ones((1, 1), bool))
-
-
-def test_depth_is_exact_for_exact_positions():
-    translations = [np.array([0.3, 0.0, 0.1]), np.array([-0.2, 0.1, 0.0])]
-    found = triangulate([observation(0.4, np.eye(3), t) for t in translations], 200.0)
-    assert found.inverse_depth.item() == pytest.approx(0.4, rel=1e-3)
-    assert found.residual.item() < 1e-2
-
-
-def test_one_wrong_position_among_many_is_outvoted():
-    translations = map(np.array, ([0.3, 0.0, 0.0], [-0.3, 0.0, 0.0], [0.0, 0.3, 0.0], [0.2, 0.2, 0.0]))
-    wrong = observation(3.0, np.eye(3), np.array([0.25, 0.0, 0.0]))
-    found = triangulate([*(observation(0.4, np.eye(3), t) for t in translations), wrong], 200.0)
-    assert found.inverse_depth.item() == pytest.approx(0.4, rel=0.05)
-
-
-def test_a_pixel_that_only_one_frame_sees_has_no_depth():
-    found = triangulate([observation(0.4, np.eye(3), np.array([0.3, 0.0, 0.0]))], 200.0)
-    assert np.isnan(found.inverse_depth).all()
-
-
-def test_unknown_pixels_are_filled_from_the_nearest():
-    plane = np.full((3, 5), np.nan, np.float32)
-    assert not fill_unknown(plane).any()
-    plane[1, 0], plane[1, 4] = 2.0, 7.0
-    assert fill_unknown(plane)[1].tolist()[:2] == [2.0, 2.0]
-    assert fill_unknown(plane)[1].tolist()[3:] == [7.0, 7.0]
-
-
-def test_neighbours_are_near_and_in_both_directions(frames):
-    assert {k < 12 for k in frames.neighbours[12]} == {True, False}
-    assert max(abs(k - 12) for k in frames.neighbours[12]) <= 4
-    assert min(frames.neighbours[0]) > 0
-
-
-def test_a_flow_is_computed_once_until_both_frames_are_released(video, monkeypatch):
-    flows, computed = Flows(video[0][:3]), []
-    monkeypatch.setattr(flows, "compute", lambda a, b, start: computed.append(1) or np.zeros((*a.shape, 2), np.float32))
-    for pair in ((0, 1), (1, 2), (0, 1), (2, 0), (0, 1)):
-        flows.flow(*pair)
-    assert len(computed) == 3
-    flows.release(0)
-    flows.flow(0, 1)
-    assert len(computed) == 3
-    flows.release(1)
-    flows.flow(1, 2)
-    assert len(computed) == 3
-    flows.flow(0, 1)
-    assert len(computed) == 4
-
-
-def test_flow_that_starts_where_the_cameras_say_is_right_over_wide_steps(video, frames):
-    """Eight frames apart, the wall moves by a fifth of the image."""
-    truth = np.stack([boards.depth(boards.pose(k / 23)) for k in range(24)])
-    agreeing = {}
-    for expected in (None, frames.expected_flow):
-        flows = Flows(brighten(frames.images), expected)
-        fractions = []
-        for a, b in ((2, 10), (8, 16), (14, 22)):
-            rotation, translation = frames.relative(a, b)
-            points = frames.rotated_rays(rotation) * truth[a] + translation[:, None, None]
-            column, row = frames.lens.image(points[0] / points[2], points[1] / points[2])
-            x, y, _ = flows.track(a, b)
-            inside = (column > 0) & (column < 256) & (row > 0) & (row < 192) & ~video[1][a]
-            fractions.append((np.hypot(x + 0.5 - column, y + 0.5 - row) < 1.0)[inside].mean())
-        agreeing[expected is None] = np.mean(fractions)
-    assert agreeing[False] > 0.6
-    assert agreeing[False] > agreeing[True] + 0.1
-
-
-def test_expected_flow_is_exact_on_a_plane_at_the_median_depth():
-    poses = np.stack([np.eye(4)[:3], np.eye(4)[:3]])
-    poses[1, 0, 3] = -0.5
-    plane = PosedFrames([np.zeros((192, 256, 3), np.uint8)] * 2, boards.lens(), poses, np.array([[0.0, 0.0, 5.0]] * 5))
-    assert np.allclose(plane.expected_flow(0, 1), [-0.5 * boards.FOCAL / 5.0, 0.0], atol=1e-3)
 
 
 @pytest.mark.parametrize("estimate", ["masks", "depth"])
@@ -130,7 +28,7 @@ def test_every_flow_is_computed_once_at_half_the_size(estimate, video, monkeypat
         return compute(self, a, b, *start, **options)
 
     monkeypatch.setattr(Flows, "compute", counted)
-    frames = posed(video[0])
+    frames = boards.posed(video[0])
     find_dynamic(frames) if estimate == "masks" else static_depth(frames, video[1])
     assert len(pairs) == len(set(pairs)) > 100
     assert shapes == {(96, 128)}
@@ -138,20 +36,13 @@ def test_every_flow_is_computed_once_at_half_the_size(estimate, video, monkeypat
 
 def test_depth_of_frames_that_masks_were_found_on_is_the_same_without_flow_of_its_own(monkeypatch):
     images, dynamic = boards.record(10)
-    fresh, used = posed(images), posed(images)
+    fresh, used = boards.posed(images), boards.posed(images)
     expected = static_depth(fresh, dynamic)
     used.halved.triangulated = {}
     find_dynamic(used)
     assert fresh.halved.triangulated is None
     monkeypatch.delattr(Flows, "compute")
     assert np.array_equal(static_depth(used, dynamic), expected, equal_nan=True)
-
-
-def test_errors_of_halved_frames_are_in_pixels_of_the_whole_ones(frames):
-    small = frames.halved
-    assert (small.lens.width, small.lens.height, small.focal) == (128, 96, frames.lens.focal[0])
-    assert small.neighbours == frames.neighbours
-    assert np.allclose(2.0 * small.expected_flow(2, 6), frames.expected_flow(2, 6)[::2, ::2], atol=0.5)
 
 
 def test_the_moving_board_is_masked(video, frames):
@@ -272,63 +163,13 @@ def test_evidence_on_a_thin_superpixel_counts_for_all_of_it():
 
 
 def test_nothing_is_masked_where_nothing_moves():
-    assert np.mean(find_dynamic(posed(boards.record(16, moves=False)[0]))) < 0.02
-
-
-@pytest.fixture(scope="module")
-def planes(video, frames):
-    return static_depth(frames, video[1])
-
-
-def test_depth_of_the_wall_is_correct_within_two_percent(planes):
-    region = np.s_[[[150], [170], [180]], [110, 120, 130]]
-    errors = [planes[k][region] * boards.depth(boards.pose(k / 23))[region] - 1.0 for k in range(4, 20)]
-    assert np.isfinite(errors).sum() > 50
-    assert np.nanmedian(np.abs(errors)) < 0.02
-
-
-def test_depth_is_unknown_in_dynamic_regions(video, planes):
-    assert all(np.isnan(plane[mask]).all() for plane, mask in zip(planes, video[1], strict=True))
-    assert np.mean([np.isfinite(plane).mean() for plane in planes]) > 0.5
-
-
-def test_depth_is_not_interpolated_across_an_edge_or_into_the_unknown():
-    plane = np.full((6, 8), 0.2, np.float32)
-    plane[:, 4:], plane[0, 0] = 0.9, np.nan
-    enlarged = _enlarged(plane, 16, 12)
-    assert np.array_equal(enlarged, cv2.resize(plane, (16, 12), interpolation=cv2.INTER_NEAREST), equal_nan=True)
-    slanted = np.tile(np.linspace(0.5, 0.6, 8, dtype=np.float32), (6, 1))
-    steps = np.diff(_enlarged(slanted, 16, 12)[5, 2:-2])
-    assert np.allclose(steps, steps[0], rtol=1e-3)  # within ``AGREEMENT``
-
-
-def test_depth_without_a_known_pixel_is_written_as_unknown(tmp_path):
-    write_depth(tmp_path, "a", as_half(np.full((4, 5), np.nan, np.float32)))
-    assert np.isnan(np.load(tmp_path / "depth/1x/a.npy")).all()
-
-
-def test_a_frame_without_any_depth_is_named(tmp_path):
-    boards.write_capture(tmp_path, 4)
-    cameras = boards.true_cameras(tmp_path, [f"shot{k:03d}" for k in range(4)])
-
-    def estimate(frames: PosedFrames, dynamic: object, weights: None, quiet: bool) -> list[np.ndarray]:
-        return [np.full((192, 256), np.nan if k == 2 else 0.5, np.float32) for k in range(4)]
-
-    summary, notes = add_depth(tmp_path, cameras, DepthMethod(estimate), None, True)
-    assert summary == "known on 75% of the pixels"
-    assert notes == ["depth is unknown everywhere in shot002"]
-
-
-def test_dark_images_are_brightened_to_middle_grey_and_black_ones_stay_black(video):
-    dark = [image // 6 for image in video[0][:2]]
-    assert np.median(brighten(dark)[0]) > 3 * np.median(dark[0])
-    assert not brighten([np.zeros((8, 8, 3), np.uint8)])[0].any()
+    assert np.mean(find_dynamic(boards.posed(boards.record(16, moves=False)[0]))) < 0.02
 
 
 @pytest.mark.parametrize("min_gap", MIN_GAPS)
 @pytest.mark.parametrize("num_frames", [24, 48])
 def test_far_frames_of_a_set_are_as_far_away_as_it_says(min_gap, num_frames):
-    frames = posed(boards.record(num_frames)[0])
+    frames = boards.posed(boards.record(num_frames)[0])
     revisits = Revisits(frames, Flows(frames.images))
     gaps = [abs(k - num_frames // 2) for k in revisits.far_frames(num_frames // 2, 0.2, min_gap)]
     assert gaps
@@ -336,7 +177,7 @@ def test_far_frames_of_a_set_are_as_far_away_as_it_says(min_gap, num_frames):
 
 
 def test_evidence_is_found_beside_both_sets_of_far_frames():
-    frames = posed(boards.record(48)[0])
+    frames = boards.posed(boards.record(48)[0])
     flows = Flows(brighten(frames.images), frames.expected_flow)
     farther, nearer = Revisits(frames, flows).evidence(24).agreements
     assert farther.witnesses.max() > 2
