@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import partial
 
-from warpgs.config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Schedule, TrainConfig
+from warpgs.config import DensifyConfig, LossConfig, ModelConfig, OptimConfig, Plan, Schedule, TrainConfig
 
 model = partial(
     replace,
@@ -74,3 +74,9 @@ config = partial(
         schedule=schedule(),
     ),
 )
+
+
+def plan(config: TrainConfig) -> Plan:
+    """The plan of a config, on the CPU, over black unless it names a colour."""
+    background = "black" if config.background in ("capture", "mean") else config.background
+    return Plan.of(config, "cpu", background, config.loss.branches_in_stage2 != "no")

@@ -13,7 +13,7 @@ from tests.scenes import make_camera
 from warpgs.config import DensifyConfig, LossConfig, ModelConfig, TrainConfig, scaled, validate
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture
-from warpgs.initialization.fitting import fitted, fitted_bands
+from warpgs.initialization.plan import determined_bands, make_plan
 from warpgs.training.command import parse
 
 
@@ -114,7 +114,7 @@ def test_the_default_preset_depends_on_whether_there_is_a_capture(arguments, pre
 def test_frequencies_of_time_are_those_that_the_frames_determine(num_frames, bands):
     """The highest one has a period of at least 4 frames: 2 (T − 1) / 2ᵏ ≥ 4."""
     model = ModelConfig(time_bands=10, min_period=4.0)
-    assert fitted_bands(model, num_frames) == bands
+    assert determined_bands(model, num_frames) == bands
     assert bands == 1 or 2 * (num_frames - 1) / 2 ** (bands - 1) >= 4.0
 
 
@@ -128,14 +128,12 @@ def no_frame(name):
 def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, estimated):
     cameras = {"a": make_camera()}
     capture = Capture("shot", cameras, ["a"], [], torch.zeros(0, 3), None, no_frame, estimated_masks=estimated)
-    lines: list[str] = []
-    config = plain.config(assume=assume, loss=LossConfig(branches_in_stage2=asked))
-    found = fitted(config, capture, lines.append).loss.branches_in_stage2
+    plan, notes = make_plan(plain.config(assume=assume, loss=LossConfig(branches_in_stage2=asked)), capture)
     distrusted = asked == "given-masks" and estimated and assume == "masks"
-    assert found == ("no" if distrusted else "yes" if asked == "given-masks" else asked)
-    assert [line.partition(":")[0] for line in lines] == (["the masks are estimates"] if distrusted else [])
+    assert plan.branches_in_stage2 == (asked != "no" and not distrusted)
+    assert [note.partition(":")[0] for note in notes] == (["the masks are estimates"] if distrusted else [])
 
 
 def test_without_a_minimum_period_all_frequencies_are_used():
-    assert fitted_bands(ModelConfig(time_bands=10, min_period=0.0), 3) == 10
-    assert fitted_bands(ModelConfig(time_bands=0, min_period=4.0), 3) == 0
+    assert determined_bands(ModelConfig(time_bands=10, min_period=0.0), 3) == 10
+    assert determined_bands(ModelConfig(time_bands=0, min_period=4.0), 3) == 0

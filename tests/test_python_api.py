@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import warpgs
+from tests import plain
 from warpgs.cameras import Camera
 from warpgs.config import TrainConfig
 from warpgs.runs.config_file import read_config, write_config
@@ -90,7 +91,7 @@ def test_a_camera_that_cannot_be_is_refused_in_one_line(change, message):
 
 def test_a_config_may_hold_numbers_of_numpy(tmp_path):
     numbers = {"seed": np.int64(5), "max_alpha": np.float64(0.5), "depth": np.bool_(False), "factor": np.int32(2)}
-    write_config(tmp_path, TrainConfig(**numbers))
+    write_config(tmp_path, plain.plan(TrainConfig(**numbers)))
     config = read_config(tmp_path)
     assert (config.seed, config.max_alpha, config.depth, config.factor) == (5, 0.5, False, 2)
 

@@ -96,7 +96,7 @@ def finished(folder: Path) -> Path:
     """Trains a run through all stages; its capture is in the same folder."""
     data = write(folder / "capture")
     config = dataclasses.replace(CONFIG, data=data, out=folder / "run")
-    Run.create(folder / "run", config)
+    Run.create(folder / "run", plain.plan(config))
     with in_haste():
         train(trainer(data, folder / "run", config))
     return folder / "run"

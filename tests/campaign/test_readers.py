@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from tests import plain
 from tests.campaign.damage import Hang, damage, refusal
 from tests.data import layouts
 from tests.data.captures import read_all, write_array, write_capture, write_json, write_png
@@ -122,7 +123,7 @@ def write_small_files(root):
             archive.writestr(f"{compression}.exr", layouts.exr(np.ones((20, 37)), compression))
     write_png(root / "image.png", layouts.image(0))
     cv2.imwrite(str(root / "image.jpg"), layouts.image(0))
-    write_config(root, TrainConfig())
+    write_config(root, plain.plan(TrainConfig()))
     write_json(root / "metrics.json", METRICS)
     (root / "views.csv").write_text(VIEWS)
 

@@ -69,7 +69,7 @@ def trained_scene(num_static=40, num_dynamic=20, seed=0):
     for field in (scene.deformation, scene.appearance):
         for parameter in field.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
-    return TrainedScene(scene.requires_grad_(False), plain.config(model=tiny.MODEL, device="cpu"), METADATA)
+    return TrainedScene(scene.requires_grad_(False), plain.plan(plain.config(model=tiny.MODEL)), METADATA)
 
 
 def _random(num):

@@ -13,7 +13,7 @@ from warpgs.config import RenderSettings
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture, Frame
 from warpgs.initialization import tracks as module
-from warpgs.initialization.fitting import fitted
+from warpgs.initialization.plan import make_plan
 from warpgs.initialization.silhouettes import Region
 from warpgs.initialization.tracked_start import MAX_FINAL_RATE, MAX_RATE
 from warpgs.initialization.tracks import _divided, find_tracks
@@ -153,32 +153,31 @@ def test_too_few_frames_are_not_tracked(tmp_path):
 
 @pytest.mark.parametrize("preset", ["best", "quick"])
 def test_the_config_follows_tracks_from_the_start(capture, tracks, preset):
-    lines: list[str] = []
-    found = fitted(PRESETS[preset], capture, lines.append)
+    found, notes = make_plan(PRESETS[preset], capture)
     assert (found.model.deformation, found.model.paths) == ("splines", 5)
     assert found.model.path_points == len(tracks[0].path.c)
     assert (found.schedule.deform_from, found.schedule.noise_until) == (0, 0)
     assert found.optim.networks == MAX_RATE
     assert found.optim.networks_end == min(MAX_FINAL_RATE, PRESETS[preset].optim.networks_end)
-    assert "5 objects move far from frame to frame: dynamic Gaussians start on their tracks" in lines
+    assert "5 objects move far from frame to frame: dynamic Gaussians start on their tracks" in notes
 
 
 def test_the_paper_starts_without_tracks(capture):
-    assert fitted(PRESETS["paper"], capture, print).model.deformation == "mlp"
+    assert make_plan(PRESETS["paper"], capture)[0].model.deformation == "mlp"
 
 
 def test_tracks_can_be_switched_off(capture):
     model = dataclasses.replace(PRESETS["quick"].model, tracks=False)
-    assert fitted(dataclasses.replace(PRESETS["quick"], model=model), capture, print).model.deformation == "mlp"
+    assert make_plan(dataclasses.replace(PRESETS["quick"], model=model), capture)[0].model.deformation == "mlp"
     model = dataclasses.replace(model, deformation="splines")
     with pytest.raises(ValueError, match="splines"):
-        fitted(dataclasses.replace(PRESETS["quick"], model=model), capture, print)
+        make_plan(dataclasses.replace(PRESETS["quick"], model=model), capture)
 
 
 def test_splines_are_refused_where_nothing_is_tracked(tmp_path):
     config = plain.config(model=dataclasses.replace(plain.config().model, deformation="splines"))
     with pytest.raises(ValueError, match="no small objects are tracked"):
-        fitted(config, load_capture(tiny.write(tmp_path)), print)
+        make_plan(config, load_capture(tiny.write(tmp_path)))
 
 
 @pytest.fixture
@@ -187,7 +186,7 @@ def trainer(data, capture, tmp_path):
     schedule = plain.schedule(stage1=20, stage2=10, densify_until=0, reset_every=1_000, prune_every=1_000)
     optim = plain.optim(opacities=0.3)
     config = dataclasses.replace(tiny.CONFIG, background="capture", model=model, schedule=schedule, optim=optim)
-    return tiny.trainer(data, tmp_path / "run", fitted(config, capture, print))
+    return tiny.trainer(data, tmp_path / "run", config)
 
 
 def test_dynamic_gaussians_start_on_the_balls_at_all_times(trainer):

@@ -17,7 +17,8 @@ from warpgs.locks import lock_folder
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs
 from warpgs.runs.config_file import read_config
-from warpgs.runs.run import Run, choose_device, locked_new_folder, new_folder, open_run
+from warpgs.runs.run import Run, locked_new_folder, new_folder, open_run
+from warpgs.runtime.devices import choose_device
 from warpgs.training.schedule import Protocol
 
 UNUSUAL = dataclasses.replace(
@@ -33,7 +34,7 @@ UNUSUAL = dataclasses.replace(
 
 
 def create(config, capture):
-    return Run.create(new_folder(config, capture), config).folder
+    return Run.create(new_folder(config, capture), plain.plan(config)).folder
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +54,9 @@ def edit(run, change):
 
 
 @pytest.mark.parametrize("config", [*PRESETS.values(), scaled(PRESETS["best"]), UNUSUAL, tiny.CONFIG])
-def test_a_config_round_trips(tmp_path, capture, config):
+def test_a_plan_round_trips(tmp_path, capture, config):
     config = dataclasses.replace(config, out=tmp_path / "run", data=tmp_path)
-    assert read_config(create(config, capture)) == config
+    assert read_config(create(config, capture)) == plain.plan(config)
 
 
 def test_a_run_prints_as_what_was_trained_on_what(tmp_path, capture):
@@ -149,8 +150,19 @@ def test_runs_of_a_preset_that_is_gone_keep_their_options(run):
 
 @pytest.mark.parametrize(("before", "now"), [(True, "yes"), (False, "no")])
 def test_whether_stage_2_compares_branches_was_a_yes_or_no(run, before, now):
-    edit(run, lambda values: values["loss"].update(branches_in_stage2=before))
-    assert read_config(run).loss.branches_in_stage2 == now
+    def change(values):
+        values["loss"]["branches_in_stage2"] = before
+        del values["branches_in_stage2"]
+
+    edit(run, change)
+    plan = read_config(run)
+    assert (plan.branches_in_stage2, plan.loss.branches_in_stage2) == (before, now)
+
+
+def test_a_background_and_a_device_that_were_not_looked_up_are_black_and_that_of_the_machine(run, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    edit(run, lambda values: values.update(background="capture", device=None))
+    assert (read_config(run).background, read_config(run).device) == ("black", "cuda")
 
 
 @pytest.mark.parametrize(
@@ -256,7 +268,7 @@ def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, 
 
     edit(run, reduce)
     densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01, max_size=0.1)
-    assert read_config(run) == dataclasses.replace(written, data=None, background="black", densify=densify)
+    assert read_config(run) == plain.plan(dataclasses.replace(written, data=None, densify=densify))
 
 
 def test_a_section_that_is_not_an_object_is_refused(run):
@@ -372,7 +384,7 @@ def test_a_scene_is_not_read_with_the_config_of_another_run(run, data):
     tiny.trainer(data, run).save()
     other = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, width=16))
     with pytest.raises(ValueError, match="does not hold a scene of this run's config"):
-        Run(run, other).trained_scene()
+        Run(run, plain.plan(other)).trained_scene()
 
 
 def run_with_poses(data, folder):
@@ -383,7 +395,7 @@ def run_with_poses(data, folder):
     for parameter in trainer.views.poses.parameters():
         parameter.data[:] = 0.01 * torch.randn(parameter.shape)
     trainer.save()
-    return Run.create(folder, config), trainer
+    return Run.create(folder, plain.plan(config)), trainer
 
 
 def test_training_cameras_are_where_training_moved_them_and_the_others_stay(data, tmp_path, capture):

@@ -13,14 +13,12 @@ import torch
 from tests import plain, tiny
 from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig, validate
-from warpgs.data.capture import background_color
 from warpgs.evaluation import evaluate_run
 from warpgs.export.clouds import Clouds
 from warpgs.export.start_camera import start_view
 from warpgs.files import write_png
-from warpgs.initialization import fitting
-from warpgs.initialization.fitting import fitted, mean_color
-from warpgs.initialization.prepare_start import prepare_start
+from warpgs.initialization import plan as module
+from warpgs.initialization.plan import make_plan, mean_color
 from warpgs.rendering import Layer
 from warpgs.runs.run import Run, open_run
 from warpgs.synthetic.balls import BallsSize, balls_capture
@@ -78,6 +76,11 @@ def older(run, tmp_path):
     return edited(shutil.copytree(run, tmp_path / "older"), lambda values: values.pop("background"))
 
 
+def background_of(config, capture):
+    """The background of a run that is begun with a config."""
+    return make_plan(config, capture)[0].background
+
+
 def backgrounds(trainer):
     """What the next step composites behind the joint, the static and the dynamic image."""
     trainer.step(trainer.protocol.at(trainer.iteration), trainer._sample(trainer.protocol.at(trainer.iteration)))
@@ -130,9 +133,8 @@ def test_a_run_without_a_background_stays_over_black_with_empty_pixels_to_paint(
 
 @pytest.mark.parametrize("asked", ["black", "white"])
 def test_an_option_overrides_the_background_of_the_capture(capture, asked):
-    config = fitted(plain.config(background=asked), capture, print)
-    assert config.background == asked
-    assert fitted(plain.config(), capture, print).background == "white"
+    assert background_of(plain.config(background=asked), capture) == asked
+    assert background_of(plain.config(), capture) == "white"
     assert (capture.over(asked).frame("train_r_000").empty is None) == (asked == "black")
 
 
@@ -174,13 +176,6 @@ def test_the_psnr_of_training_is_finite_where_nothing_is_wrong(run, tmp_path):
         trainer.scene.dynamic.logit_opacities.fill_(-20.0)
     backgrounds(trainer)
     assert trainer.step.take_means().psnr == pytest.approx(58.9, abs=0.05)
-
-
-@pytest.mark.parametrize("background", ["capture", "mean"])
-def test_no_start_is_prepared_with_a_background_that_was_not_looked_up(capture, background):
-    assert capture.background == "white"
-    with pytest.raises(ValueError, match=f'background is "{background}": call fitted'):
-        prepare_start(plain.config(device="cpu", background=background), capture)
 
 
 @pytest.fixture(scope="module")
@@ -230,13 +225,13 @@ def test_a_resumed_run_goes_on_as_it_would_have(name, request, tmp_path):
 
 
 def test_a_capture_over_white_stays_so_where_others_get_the_mean(capture):
-    assert fitted(plain.config(background="mean"), capture, print).background == "white"
-    assert fitted(plain.config(background="mean"), capture.over("black"), print).background == mean_color(capture)
+    assert background_of(plain.config(background="mean"), capture) == "white"
+    assert background_of(plain.config(background="mean"), capture.over("black")) == mean_color(capture)
 
 
 def test_the_mean_of_many_frames_is_that_of_some_of_them(capture, monkeypatch):
     everything = mean_color(capture)
-    monkeypatch.setattr(fitting, "MAX_AVERAGED", 2)
+    monkeypatch.setattr(module, "MAX_AVERAGED", 2)
     assert mean_color(capture) != everything
     assert mean_color(capture) == pytest.approx(everything, abs=0.1)
 
@@ -253,15 +248,10 @@ def test_a_background_that_is_no_colour_is_refused(mean_run, tmp_path, color):
 )
 def test_a_background_may_be_given_in_rgb(capture, words, expected):
     config = parse(["--data", "x", "--background", *words.split()])
-    assert fitted(config, capture, print).background == expected
+    assert background_of(config, capture) == expected
 
 
 @pytest.mark.parametrize("background", ["grey", [0.1, 0.2, 0.3], (0.5, 0.5), (0.5, 0.5, 1.5), 0.5])
 def test_a_background_that_is_no_colour_is_refused_before_training(background):
     with pytest.raises(ValueError, match="background must be capture, mean, black, white, or three numbers"):
         validate(plain.config(background=background))
-
-
-def test_a_colour_that_is_not_known_yet_is_not_black():
-    with pytest.raises(ValueError, match='background is "mean": call fitted'):
-        background_color("mean")

@@ -10,7 +10,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import warpgs
-from tests import tiny
+from tests import plain, tiny
 from warpgs.config import TrainConfig
 from warpgs.runs import checkpoint, preview
 from warpgs.runs.config_file import read_config
@@ -161,22 +161,22 @@ def test_a_run_is_extended(config):
 
 
 def test_the_last_stage_takes_the_added_iterations():
-    longer = Protocol(extended(tiny.CONFIG, 50), has_depth=True)
+    longer = Protocol(extended(plain.plan(tiny.CONFIG), 50), has_depth=True)
     assert (longer.stage1.end, longer.stage2.end) == (22, 50)
     only = dataclasses.replace(tiny.CONFIG, schedule=dataclasses.replace(tiny.SCHEDULE, stage2=0))
-    assert Protocol(extended(only, 50), has_depth=True).stage1.end == 50
+    assert Protocol(extended(plain.plan(only), 50), has_depth=True).stage1.end == 50
 
 
 def test_the_gaussians_of_a_longer_run_settle_at_its_end():
     settling = dataclasses.replace(tiny.CONFIG, schedule=dataclasses.replace(tiny.SCHEDULE, settle=8))
-    longer = Protocol(extended(settling, 50), has_depth=True)
+    longer = Protocol(extended(plain.plan(settling), 50), has_depth=True)
     assert [longer.at(k).phase.use_dropout for k in (30, 41, 42)] == [True, True, False]
     assert [longer.at(k).settle_progress for k in (30, 42, 46)] == [0.0, 0.0, 0.5]
 
 
 def test_a_run_is_not_shortened():
     with pytest.raises(ValueError, match="expected at least its 32, got 31"):
-        extended(tiny.CONFIG, 31)
+        extended(plain.plan(tiny.CONFIG), 31)
 
 
 def test_a_held_out_frame_that_cannot_be_read_ends_the_held_out_images_and_not_the_training():

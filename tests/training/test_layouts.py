@@ -6,8 +6,6 @@ import pytest
 
 from tests import tiny
 from tests.data import layouts
-from warpgs.captures.opening import load_capture
-from warpgs.initialization.fitting import fitted
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -18,7 +16,7 @@ def test_training_runs_through_all_stages(layout, tmp_path):
     schedule = dataclasses.replace(tiny.SCHEDULE, pretrain=2, realign_at=1, stage1=2, stage2=1, prune_every=50)
     assume = "dynamic" if layout == "megasam" else "masks"
     config = dataclasses.replace(tiny.CONFIG, assume=assume, schedule=schedule)
-    trainer = tiny.trainer(data, tmp_path / "run", fitted(config, load_capture(data), lambda line: None))
+    trainer = tiny.trainer(data, tmp_path / "run", config)
     assert tiny.train(trainer)
     assert len(trainer.scene.dynamic) > 0
     assert (len(trainer.scene.static) == 0) == (layout in ("megasam", "blender"))

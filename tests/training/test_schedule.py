@@ -132,14 +132,15 @@ def test_the_joint_term_is_active_in_stage_2_only(app):
 BRANCH_TERMS = {"static", "dynamic", "depth", "depth_dynamic"}
 
 
-@pytest.mark.parametrize("keeps", ["yes", "no"])
+@pytest.mark.parametrize("keeps", [True, False])
 def test_in_stage_2_the_terms_of_single_branches_can_end(keeps):
-    loss = dataclasses.replace(CONFIG.loss, branches_in_stage2=keeps)
-    before, after = (protocol(loss=loss).at(iteration).phase for iteration in (STAGE1, STAGE2))
+    loss, config = CONFIG.loss, dataclasses.replace(CONFIG, schedule=SHORT)
+    found = Protocol(config, has_depth=True, branches_in_stage2=keeps)
+    before, after = (found.at(iteration).phase for iteration in (STAGE1, STAGE2))
     terms = {name: TERMS[name] for name in (*BRANCH_TERMS, "joint")}
     assert {name for name, term in terms.items() if term.is_active(before, loss)} == BRANCH_TERMS
     active = {name for name, term in terms.items() if term.is_active(after, loss)}
-    assert active == ({*BRANCH_TERMS, "joint"} if keeps == "yes" else {"joint"})
+    assert active == ({*BRANCH_TERMS, "joint"} if keeps else {"joint"})
 
 
 def test_without_stage_2_there_is_no_joint_term():

@@ -137,6 +137,7 @@ def test_phases_that_differ_in_one_field_are_different_keys(field):
         use_appearance=True,
         sh_degree=1,
         with_depth=True,
+        with_branches=True,
         with_joint=True,
         use_dropout=True,
         densifies=True,

@@ -10,16 +10,21 @@ from .masks import MaskPerturbation
 from .model import ModelConfig
 from .optim import OptimConfig
 from .options import NetName, TrainConfig, scaled, validate
+from .plan import Background, Color, Device, Plan
 from .render_settings import RenderSettings
 from .schedule import Schedule
 
 __all__ = [
+    "Background",
+    "Color",
     "DensifyConfig",
+    "Device",
     "LossConfig",
     "MaskPerturbation",
     "ModelConfig",
     "NetName",
     "OptimConfig",
+    "Plan",
     "RenderSettings",
     "Schedule",
     "TrainConfig",

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from warpgs.cameras import Camera
+from warpgs.config import Background, Color
 from warpgs.errors import suggestion
 
 from .median_depth import median_depth
@@ -42,25 +43,13 @@ Assumption = Literal["masks", "static", "dynamic"]
 MASKS_REMEDY = "with warpgs prepare CAPTURE --add masks, or train with --assume static or --assume dynamic"
 """How to go on without masks: the end of a message that says what to make."""
 
-Color = tuple[float, float, float]
-"""Red, green and blue in [0, 1]."""
-Background = Literal["black", "white"] | Color
-"""Colour behind all Gaussians."""
-
 COLORS: dict[Literal["black", "white"], Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 """RGB of the named backgrounds."""
 
 
-def background_color(background: Background | Literal["capture", "mean"]) -> Color:
-    """RGB in [0, 1].
-
-    Raises:
-        ValueError: If it is to be looked up in a capture first (``fitted``). "capture" is black: runs of earlier
-            versions kept it in their config.
-    """
-    if background == "mean":
-        raise ValueError('background is "mean": call fitted(config, capture, log) first')
-    return background if isinstance(background, tuple) else COLORS["white" if background == "white" else "black"]
+def background_color(background: Background) -> Color:
+    """RGB in [0, 1]."""
+    return background if isinstance(background, tuple) else COLORS[background]
 
 
 def path_radius(cameras: Sequence[Camera]) -> float:

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.data.capture import COLORS, Capture, Color, background_color
+from warpgs.config import Color
+from warpgs.data.capture import COLORS, Capture, background_color
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.video import camera_paths
 from warpgs.video.filmed import Filmed

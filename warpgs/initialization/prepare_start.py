@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import torch
 
-from warpgs.config import TrainConfig
+from warpgs.config import Plan, TrainConfig
 from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import dynamic_counts, unknown_depth
 from warpgs.data.empty_masks import wrongly_empty
 from warpgs.errors import command
 from warpgs.model.poses import PoseCorrections
-from warpgs.runs.captures import known_background
 from warpgs.runtime import ranks
 from warpgs.runtime.random_numbers import random_numbers
 from warpgs.views.views import Views
@@ -19,35 +18,45 @@ from .alignment import DepthTrust, align_to_points, require_no_depth
 from .exposure import exposure_gains
 from .initialize import fits_motion, initial_scene
 from .object_depth import fill_object_depth
+from .plan import make_plan
 from .start import Remedy, Start
 
 NO_DEPTH = "training without depth, and without the pretraining that needs it"
 
 
-def prepare_start(plan: TrainConfig, capture: Capture) -> Start:
-    """What training starts from.
+def prepare_start(config: TrainConfig, capture: Capture) -> Start:
+    """What a new training starts from.
 
     All ranks of torchrun must call it.
 
     Args:
-        plan: Resolved config: schedule rescaled, device chosen, values that depend on the capture looked up
-            (``fitting.fitted``).
-        capture: Capture to train on, as ``open_capture(plan)`` reads it.
+        config: What was asked for.
+        capture: Capture to train on, as ``open_capture(config)`` reads it.
 
     Raises:
-        ValueError: If a training frame has no mask, is damaged, or has depth that the plan excludes, or an option has
-            an unknown value.
+        ValueError: If a training frame has no mask, is damaged, or has depth that the config excludes, or an option has
+            an unknown value or one that the capture does not suit.
     """
-    start = _read(plan, capture.assuming(plan.assume).over(known_background(plan, capture)))
+    plan, notes = make_plan(config, capture)
+    return _with_remedies(_read(plan, capture, notes))
+
+
+def prepare_again(plan: Plan, capture: Capture) -> Start:
+    """What a run starts from that was begun with a plan, before its checkpoint is restored; as ``prepare_start``."""
+    return _with_remedies(_read(plan, capture, []))
+
+
+def _with_remedies(start: Start) -> Start:
     for remedy in REMEDIES:
         if remedy.applies(start):
             start = remedy.apply(start)
     return start
 
 
-def _read(plan: TrainConfig, capture: Capture) -> Start:
+def _read(plan: Plan, capture: Capture, notes: list[str]) -> Start:
     """The start before any remedy but that of exposure, which is divided out where images are decoded."""
-    num, device = len(capture.train), torch.device(plan.device or "cpu")
+    capture = capture.assuming(plan.assume).over(plan.background)
+    num, device = len(capture.train), torch.device(plan.device)
     gains = exposure_gains(capture) if plan.exposure else torch.ones(num, 3, dtype=torch.float32)
     jumps = (gains != 1.0).any(1)
     poses = PoseCorrections(num, capture.view_size).to(device) if plan.optim.poses else None
@@ -68,6 +77,7 @@ def _read(plan: TrainConfig, capture: Capture) -> Start:
         torch.full((num, 2), torch.nan, dtype=torch.float32, device=device),
         torch.full((num,), torch.inf, dtype=torch.float32, device=device),
         DepthTrust(*torch.ones(2, num, dtype=torch.float32, device=device)),
+        notes=tuple(notes),
     )
     if (cache := views.cache) is not None:
         read = "read from a file" if cache.fits else "decoded in every iteration: there is no space for a file"

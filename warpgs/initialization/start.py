@@ -7,7 +7,7 @@ from typing import NamedTuple
 from jaxtyping import Float
 from torch import Tensor
 
-from warpgs.config import TrainConfig
+from warpgs.config import Plan
 from warpgs.data.capture import Capture
 from warpgs.model.scene import SplitScene
 from warpgs.views.views import Views
@@ -20,7 +20,7 @@ class Start:
     """What training starts from.
 
     Attributes:
-        plan: What runs: the config, with the values that depend on the capture (``fitting.fitted``).
+        plan: What runs.
         capture: The capture, with the masks and background that the plan implies.
         views: Its training views; remedies change their depth and the trust in their masks in place.
         scene: The initial scene.
@@ -35,7 +35,7 @@ class Start:
         notes: A sentence of each remedy on what it found or changed.
     """
 
-    plan: TrainConfig
+    plan: Plan
     capture: Capture
     views: Views
     scene: SplitScene

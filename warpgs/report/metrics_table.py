@@ -70,7 +70,7 @@ def config_rows(configs: Sequence[TrainConfig]) -> list[tuple[str, list[str]]]:
     """Settings that differ between runs; for a single run, those that differ from its preset."""
     usual = [PRESETS[configs[0].preset or "best"]] if len(configs) == 1 else []
     flat = [{name: value for name, _, value in fields(config)} for config in (*configs, *usual)]
-    names = [name for name in flat[0] if name not in UNRELATED and len({repr(values[name]) for values in flat}) > 1]
+    names = [name for name in flat[-1] if name not in UNRELATED and len({repr(values[name]) for values in flat}) > 1]
     return [(name, [_setting(name, values[name]) for values in flat[: len(configs)]]) for name in names]
 
 

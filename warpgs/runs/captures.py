@@ -1,7 +1,6 @@
 """The capture that a run is trained on."""
 
-from warpgs.config import TrainConfig
-from warpgs.data.capture import Background, Capture
+from warpgs.data.capture import Capture
 
 from .checkpoint import Metadata
 
@@ -19,15 +18,3 @@ def require_same_times(capture: Capture, metadata: Metadata) -> None:
                 "frame has time 0 and the last one time 1, so both must stay the same (but their images may be "
                 "replaced by others of the same size)"
             )
-
-
-def known_background(config: TrainConfig, capture: Capture) -> Background:
-    """The background of a config.
-
-    Raises:
-        ValueError: If it depends on the capture and was not looked up. Runs of earlier versions, whose config does not
-            know it, are over black.
-    """
-    if config.background == "mean" or (config.background == "capture" and capture.background == "white"):
-        raise ValueError(f'background is "{config.background}": call fitted(config, capture, log) first')
-    return "black" if config.background == "capture" else config.background

@@ -1,4 +1,4 @@
-"""config.json of a run folder: the training config, written and read back."""
+"""config.json of a run folder: its plan, written and read back."""
 
 import dataclasses
 import json
@@ -8,10 +8,11 @@ import typing
 from pathlib import Path
 from typing import Any
 
-from warpgs.config import TrainConfig, validate
+from warpgs.config import Plan, TrainConfig, validate
 from warpgs.config.builtin import is_builtin
 from warpgs.errors import missing, suggestion
 from warpgs.files import read_json, write_text
+from warpgs.runtime.devices import choose_device
 
 NAME = "config.json"
 MAX_BYTES = 1 << 20
@@ -102,7 +103,7 @@ def former_option(name: str) -> str:
     return ""
 
 
-def write_config(folder: Path, config: TrainConfig) -> None:
+def write_config(folder: Path, config: Plan) -> None:
     """Writes config.json into a run folder, with absolute paths.
 
     Raises:
@@ -119,8 +120,8 @@ def _as_json(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else str(value)
 
 
-def read_config(folder: Path) -> TrainConfig:
-    """The training config of a run folder.
+def read_config(folder: Path) -> Plan:
+    """The plan of a run folder; if it does not name a device, it is that of ``choose_device``.
 
     Raises:
         ValueError: If the folder or its config.json does not exist, or the file is damaged, or has unknown or mistyped
@@ -131,23 +132,30 @@ def read_config(folder: Path) -> TrainConfig:
         raise ValueError(missing(folder))
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
-    config = parse_config(_with_old_meaning(read_json(path, max_bytes=MAX_BYTES)), path)
-    return dataclasses.replace(config, out=folder)
+    plan: Plan = _parse(Plan, _with_old_meaning(read_json(path, max_bytes=MAX_BYTES)), path)
+    _validate(plan, path)
+    return dataclasses.replace(plan, out=folder)
 
 
 def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
     """Values as today's version writes those of an earlier one, so that its runs are resumed as they were begun.
 
     Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that
-    is gone is none: the file has all of its values. ``loss.branches_in_stage2`` was a yes or no. The options of
-    ``REMOVED`` changed nothing that is still to be done, but for ``densify.depth_gradients``: terms of depth count from
-    now on where densification did not look at them.
+    is gone is none: the file has all of its values. ``loss.branches_in_stage2`` was a yes or no, and later what runs as
+    well as what was asked for. A background that was not looked up is black. The options of ``REMOVED`` changed nothing
+    that is still to be done, but for ``densify.depth_gradients``: terms of depth count from now on where densification
+    did not look at them.
     """
     if values.get("preset") in REMOVED_PRESETS:
         values = {**values, "preset": None}
+    if values.get("background") == "capture":
+        values = {**values, "background": "black"}
+    if values.get("device") is None:
+        values = {**values, "device": choose_device()}
     if isinstance(loss := values.get("loss"), dict):
         if isinstance(branches := loss.get("branches_in_stage2"), bool):
             loss = {**loss, "branches_in_stage2": "yes" if branches else "no"}
+        values = {"branches_in_stage2": loss.get("branches_in_stage2") != "no", **values}
         if values.get("dap") is False and "depth_gate" not in loss:
             loss = {**loss, "depth": 0.0}
         values = {**values, "loss": loss}
@@ -168,11 +176,16 @@ def parse_config(values: dict[str, Any], source: Path | str) -> TrainConfig:
         ValueError: If there are unknown, missing or mistyped fields, or numbers out of their range.
     """
     config: TrainConfig = _parse(TrainConfig, values, source)
+    _validate(config, source)
+    return config
+
+
+def _validate(config: TrainConfig, source: Path | str) -> None:
+    """Raises ValueError, which names the source, if a number is out of its range."""
     try:
         validate(config)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
-    return config
 
 
 def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:

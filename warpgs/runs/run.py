@@ -7,11 +7,10 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 
-from warpgs.config import TrainConfig
+from warpgs.config import Device, Plan, TrainConfig
 from warpgs.config.builtin import is_builtin
 from warpgs.data.capture import Capture
 from warpgs.errors import command, similar_path
@@ -19,6 +18,7 @@ from warpgs.files import partial_path
 from warpgs.locks import LOCK, lock_folder
 from warpgs.model.trunk import in_single_precision
 from warpgs.ops.mlp import limit_of_multiprocessors
+from warpgs.runtime.devices import choose_device
 
 from . import checkpoint
 from .config_file import NAME, read_config, write_config
@@ -29,19 +29,6 @@ MASK_TRIAL = "mask_trial.json"
 
 TRAINED = "trained"
 """What a process does with the run folder that it locks, for messages."""
-
-Device = Literal["cuda", "cpu"]
-
-
-def choose_device(asked: Device | None = None) -> Device:
-    """The device that was asked for; CUDA if none was and there is a GPU, else the CPU.
-
-    Raises:
-        ValueError: If CUDA was asked for and torch finds no GPU.
-    """
-    if asked == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda was asked for, but torch sees no CUDA device; use --device cpu")
-    return asked or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def new_folder(config: TrainConfig, capture: Capture) -> Path:
@@ -81,15 +68,15 @@ def locked_new_folder(config: TrainConfig, capture: Capture) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder with its config, opened for reading.
+    """A run folder with its plan, opened for reading.
 
     Attributes:
         folder: The run folder.
-        config: Its config; ``device`` is the one that the scene is opened on.
+        config: Its plan; ``device`` is the one that the scene is opened on.
     """
 
     folder: Path
-    config: TrainConfig
+    config: Plan
 
     def __repr__(self) -> str:
         data, preset = self.config.data or "the built-in scene", self.config.preset or "no preset"
@@ -111,7 +98,7 @@ class Run:
         return Run(folder, dataclasses.replace(config, device=choose_device(device), data=data or config.data))
 
     @staticmethod
-    def create(folder: Path, config: TrainConfig) -> "Run":
+    def create(folder: Path, config: Plan) -> "Run":
         """Creates a run folder and writes its config.json.
 
         Raises:
@@ -123,7 +110,7 @@ class Run:
 
     @property
     def device(self) -> torch.device:
-        return torch.device(self.config.device or "cpu")
+        return torch.device(self.config.device)
 
     def open_capture(self, quiet: bool = False) -> Capture:
         """The capture that the run was trained on; raises as ``open_capture``."""

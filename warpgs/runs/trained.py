@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.config import TrainConfig
+from warpgs.config import Plan
 from warpgs.data.capture import Capture, background_color
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
@@ -48,14 +48,14 @@ class TrainedScene:
 
     Args:
         scene: Gaussians and networks, on the device to render on.
-        config: Config of the run.
+        config: Plan of the run.
         metadata: Of the checkpoint: which networks are in use, and the degree of spherical harmonics.
 
     Attributes:
         background (Tensor | None): [3] colour behind all Gaussians, on the scene's device; None is black.
     """
 
-    def __init__(self, scene: SplitScene, config: TrainConfig, metadata: Metadata) -> None:
+    def __init__(self, scene: SplitScene, config: Plan, metadata: Metadata) -> None:
         self.scene, self.config, self.metadata = scene, config, metadata
         self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS, repeatable=True)
         self._inputs: _Inputs | None = None

@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
-from warpgs.data.capture import Color
+from warpgs.config import Color
 from warpgs.files import write_json, write_png
 from warpgs.visualize.images import averaged, to_bytes
 

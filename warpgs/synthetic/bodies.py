@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from warpgs.data.capture import Color
+from warpgs.config import Color
 
 from .raytrace import Bodies
 

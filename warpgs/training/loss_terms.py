@@ -13,7 +13,6 @@ from warpgs.rendering import Layer
 from . import losses
 from .acceleration import acceleration
 from .losses import LossInputs, LossTerm
-from .schedule import compares_branches
 
 
 def static(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -82,12 +81,12 @@ def scale(inputs: LossInputs) -> Float[Tensor, ""]:
 TERMS: dict[str, LossTerm] = {
     "static": LossTerm(
         static,
-        is_active=lambda phase, config: compares_branches(phase.stage, config),
+        is_active=lambda phase, config: phase.with_branches,
         weight=lambda plan, config: config.static,
     ),
     "dynamic": LossTerm(
         dynamic,
-        is_active=lambda phase, config: phase.stage != "pretrain" and compares_branches(phase.stage, config),
+        is_active=lambda phase, config: phase.stage != "pretrain" and phase.with_branches,
         weight=lambda plan, config: config.dynamic,
     ),
     "joint": LossTerm(

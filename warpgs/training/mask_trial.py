@@ -12,7 +12,6 @@ from warpgs.data.capture import Assumption, Capture
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
-from warpgs.initialization.fitting import fitted
 from warpgs.initialization.objects import find_all_objects, num_cut_off
 from warpgs.initialization.prepare_start import prepare_start
 from warpgs.runtime import ranks
@@ -125,7 +124,7 @@ def held_out_psnr(
             values.extend(render_and_compare(progress.scene, progress.capture.frame(name))[1] for name in held_out)
 
     with tempfile.TemporaryDirectory(prefix="warpgs-trial-") as folder, Interrupt() as interrupt:
-        start = prepare_start(fitted(config, capture, ignore), capture)
+        start = prepare_start(config, capture)
         if start.num_cut is not None:
             _warn_of_unknown_depth(whole, log)
         trainer = Trainer(start, Path(folder))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from warpgs.config import LossConfig, TrainConfig
+from warpgs.config import Plan, TrainConfig
 
 from .optimizer import BRANCHES, RatePlan, exponential
 
@@ -47,6 +47,7 @@ class Phase:
         use_appearance: Whether the appearance network is in use.
         sh_degree: Maximum degree of spherical harmonics in use.
         with_depth: Whether depth is rendered and compared.
+        with_branches: Whether the images of the single branches, and their depth, are compared.
         with_joint: Whether the joint image is compared.
         use_dropout: Whether random Gaussians are omitted.
         densifies: Whether Gaussians may still be densified, so that density control looks at their gradients.
@@ -57,14 +58,10 @@ class Phase:
     use_appearance: bool
     sh_degree: int
     with_depth: bool
+    with_branches: bool
     with_joint: bool
     use_dropout: bool
     densifies: bool
-
-
-def compares_branches(stage: StageName, config: LossConfig) -> bool:
-    """Whether the terms of the single branches count in a stage."""
-    return stage != "stage2" or config.branches_in_stage2 != "no"
 
 
 @dataclass(frozen=True)
@@ -91,27 +88,27 @@ class IterationPlan(RatePlan):
         return not REPLACING.isdisjoint(self.actions)
 
 
-def extended(config: TrainConfig, iterations: int | None) -> TrainConfig:
-    """The config of a run whose last stage is longer, so that the run takes ``iterations`` in total.
+def extended(plan: Plan, iterations: int | None) -> Plan:
+    """The plan of a run whose last stage is longer, so that the run takes ``iterations`` in total.
 
     Learning rates that decay over the run decay over the longer one: they rise where the run is continued.
 
     Args:
-        config: Config of the run, whose schedule is rescaled already.
-        iterations: Total iterations; the config stays as it is if None.
+        plan: Plan of the run.
+        iterations: Total iterations; the plan stays as it is if None.
 
     Raises:
         ValueError: If that is less than the run has.
     """
-    schedule = config.schedule
+    schedule = plan.schedule
     total = schedule.num_iterations
     if iterations is None:
-        return config
+        return plan
     if iterations < total:
         raise ValueError(f"--resume with --iterations extends a run: expected at least its {total}, got {iterations}")
     last = "stage2" if schedule.stage2 else "stage1"
     longer = replace(schedule, **{last: getattr(schedule, last) + iterations - total})
-    return replace(config, schedule=longer)
+    return replace(plan, schedule=longer)
 
 
 class Protocol:
@@ -122,9 +119,18 @@ class Protocol:
         has_depth: Whether any view has depth to compare.
         pretrains: Whether that includes depth of the static region, which pretraining needs.
         fits_motion: Whether the deformation is fitted to points before stage I, in which it is in use at once then.
+        branches_in_stage2: Whether stage II compares the images of the single branches.
     """
 
-    def __init__(self, config: TrainConfig, has_depth: bool, pretrains: bool = True, fits_motion: bool = False) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        has_depth: bool,
+        pretrains: bool = True,
+        fits_motion: bool = False,
+        branches_in_stage2: bool = True,
+    ) -> None:
+        self._branches_in_stage2 = branches_in_stage2
         self.config = config if fits_motion else replace(config, schedule=replace(config.schedule, fit_motion=0))
         self.has_depth, self.fits_motion = has_depth, fits_motion
         schedule = config.schedule
@@ -161,12 +167,14 @@ class Protocol:
         """Everything that the training step of an iteration branches on."""
         config, in_stage1 = self.config, iteration - self.stage1.start
         stage, joint_from = self.stage_at(iteration).name, config.schedule.joint_from
+        with_branches = stage != "stage2" or self._branches_in_stage2
         return Phase(
             stage=stage,
             use_deformation=in_stage1 >= self._network_starts["deformation"],
             use_appearance=config.app and in_stage1 >= self._network_starts["appearance"],
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
-            with_depth=self.has_depth and config.loss.depth > 0.0 and compares_branches(stage, config.loss),
+            with_depth=self.has_depth and config.loss.depth > 0.0 and with_branches,
+            with_branches=with_branches,
             with_joint=stage == "stage2" or (joint_from is not None and in_stage1 >= joint_from),
             use_dropout=config.model.dropout > 0.0 and 0 <= in_stage1 < self._settle_from,
             densifies=stage != "stage2" and in_stage1 < config.schedule.densify_until,

@@ -9,7 +9,7 @@ from pathlib import Path
 from warpgs.captures.check import quick_findings
 from warpgs.captures.findings import Finding
 from warpgs.captures.opening import capture_folder, open_capture
-from warpgs.config import TrainConfig, scaled
+from warpgs.config import Device, TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import describe_layout
 from warpgs.errors import command, is_out_of_memory
@@ -17,14 +17,14 @@ from warpgs.evaluation.evaluate import check_views
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.lpips import locate
 from warpgs.files import write_json
-from warpgs.initialization.fitting import fitted
-from warpgs.initialization.prepare_start import prepare_start
+from warpgs.initialization.prepare_start import prepare_again, prepare_start
 from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, write_config
-from warpgs.runs.run import MASK_TRIAL, Device, Run, choose_device, locked_new_folder
+from warpgs.runs.run import MASK_TRIAL, Run, locked_new_folder
 from warpgs.runtime import ranks
+from warpgs.runtime.devices import choose_device
 
 from .callbacks import Callback, HeldOut, Previewer
 from .interrupt import Interrupt
@@ -221,10 +221,9 @@ def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitSta
     if config.device == "cpu" and config.preset in ("best", "paper"):
         log(f"the preset {config.preset} is for a GPU; {_cpu_advice(config)}")
     config, trial = with_trusted_masks(config, capture, log, quiet)
-    config = fitted(config, capture, log)
     trainer = Trainer(prepare_start(config, capture), Path(ranks.text_of_first(folder)))
     if ranks.is_first():
-        Run.create(trainer.run, config)  # last: the folder of a run that is refused before is removed again
+        Run.create(trainer.run, trainer.config)  # last: the folder of a run that is refused before is removed again
         if trial:
             write_json(trainer.run / MASK_TRIAL, trial)
     return trainer
@@ -265,7 +264,7 @@ def _continued(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.Exi
     capture = check_capture(run.open_capture(quiet), run.config, log)
     _compare_ranks(run.config, capture)
     _read_evaluation_frames(capture, run.config, quiet)
-    trainer = Trainer(prepare_start(run.config, capture), run.folder)
+    trainer = Trainer(prepare_again(run.config, capture), run.folder)
     trainer.restore_newest(log)
     if trainer.iteration == trainer.protocol.num_iterations:
         log(FINISHED.format(trainer.iteration))

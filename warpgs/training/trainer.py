@@ -70,7 +70,9 @@ class Trainer:
         self.seconds, self._started = 0.0, time.monotonic()
         self.callbacks: Sequence[Callback] = ()
         self._earlier_peak = 0
-        self.protocol = Protocol(start.plan, start.has_depth, start.num_aligned > 0, start.fits_motion)
+        self.protocol = Protocol(
+            start.plan, start.has_depth, start.num_aligned > 0, start.fits_motion, start.plan.branches_in_stage2
+        )
         self._sampler = Sampler(self.config.seed, len(self.views), self.config.loss.dynamic_background == "black")
         self._start_from(start.scene)
 

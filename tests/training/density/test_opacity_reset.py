@@ -29,6 +29,7 @@ PHASE = Phase(
     use_appearance=False,
     sh_degree=0,
     with_depth=False,
+    with_branches=True,
     with_joint=True,
     use_dropout=False,
     densifies=False,

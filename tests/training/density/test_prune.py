@@ -199,7 +199,17 @@ def test_blend_weights_are_summed_over_the_joint_images_of_all_views(data, tmp_p
         with torch.no_grad():
             splats = as_dict(scene.splats(view.time, sh_degree=1))
             expected += reference(splats, view.camera, torch.zeros(3, dtype=torch.float64))[2].sum((1, 2))
-    phase = Phase("stage2", True, True, 1, with_depth=False, with_joint=True, use_dropout=False, densifies=False)
+    phase = Phase(
+        "stage2",
+        True,
+        True,
+        1,
+        with_depth=False,
+        with_branches=True,
+        with_joint=True,
+        use_dropout=False,
+        densifies=False,
+    )
     assert error(blend_weights(scene, views, phase), expected) < 1e-5 * expected.max()
     assert (expected > 0).sum() > len(expected) / 2
 

@@ -19,7 +19,9 @@ from warpgs.training.density.reseed import gaussians_that_show, lost_fraction, l
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.schedule import Phase
 
-PHASE = Phase("stage1", True, True, 1, with_depth=False, with_joint=True, use_dropout=False, densifies=False)
+PHASE = Phase(
+    "stage1", True, True, 1, with_depth=False, with_branches=True, with_joint=True, use_dropout=False, densifies=False
+)
 
 
 @pytest.fixture

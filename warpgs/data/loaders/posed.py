@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera
-from warpgs.config import MaskPerturbation
+from warpgs.config import Background, MaskPerturbation
 from warpgs.data.camera_files import MAX_ROTATION_ERROR, is_rotation
-from warpgs.data.capture import Assumption, Background, Capture, Conventions, Frame
+from warpgs.data.capture import Assumption, Capture, Conventions, Frame
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.masks import perturb

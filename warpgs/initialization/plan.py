@@ -1,14 +1,14 @@
-"""Values of a config that depend on the capture."""
+"""What runs: the values of a config that depend on the capture and on the machine."""
 
 import dataclasses
 import math
-from collections.abc import Callable
 
 import numpy as np
 
-from warpgs.config import ModelConfig, TrainConfig
-from warpgs.data.capture import COLORS, Background, Capture, Color, background_color
+from warpgs.config import Background, Color, ModelConfig, Plan, TrainConfig, scaled
+from warpgs.data.capture import COLORS, Capture, background_color
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.runtime.devices import choose_device
 
 from .tracked_start import for_tracks
 from .tracks import find_tracks
@@ -17,33 +17,32 @@ MAX_AVERAGED = 50
 """Maximum number of frames whose mean colour is the background."""
 
 
-def fitted(config: TrainConfig, capture: Capture, log: Callable[[str], None]) -> TrainConfig:
-    """The config with those values replaced that depend on the capture.
+def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
+    """The plan of a new run, and sentences on what was looked up.
 
     Raises:
-        ValueError: If it names a deformation model that the capture does not suit.
+        ValueError: If a number of the config is out of its range, there is no such device, or it names a deformation
+            model that the capture does not suit.
     """
-    background = _background(config, capture)
-    config = dataclasses.replace(config, background=background)
+    config, notes = scaled(config), []
+    background, loss = _background(config, capture), config.loss
     seen = capture.assuming(config.assume).over(background)
     tracks = find_tracks(seen) if config.model.tracks and config.model.deformation in ("mlp", "splines") else []
     if tracks:
-        log(f"{len(tracks)} objects move far from frame to frame: dynamic Gaussians start on their tracks")
+        notes.append(f"{len(tracks)} objects move far from frame to frame: dynamic Gaussians start on their tracks")
         config = for_tracks(config, tracks)
     elif config.model.deformation == "splines":
         raise ValueError('model.deformation "splines": no small objects are tracked in this capture; use "mlp"')
-    bands, loss = fitted_bands(config.model, len(capture.train)), config.loss
-    if bands < config.model.time_bands:
-        num = len(capture.train)
-        log(
-            f"the networks get {bands} of {config.model.time_bands} frequencies of time: {num} frames determine no more"
-        )
+    asked, num = config.model.time_bands, len(capture.train)
+    bands = determined_bands(config.model, num)
+    if bands < asked:
+        notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} frames determine no more")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
-    if loss.branches_in_stage2 == "given-masks":
-        if seen.uses_estimated_masks:
-            log("the masks are estimates: stage II compares the image of all Gaussians only, not those of each branch")
-        loss = dataclasses.replace(loss, branches_in_stage2="no" if seen.uses_estimated_masks else "yes")
-    return dataclasses.replace(config, loss=loss)
+    branches = loss.branches_in_stage2 != "no"
+    if loss.branches_in_stage2 == "given-masks" and seen.uses_estimated_masks:
+        notes.append("the masks are estimates: stage II compares the image of all Gaussians only, not each branch's")
+        branches = False
+    return Plan.of(config, choose_device(config.device), background, branches), notes
 
 
 def _background(config: TrainConfig, capture: Capture) -> Background:
@@ -67,7 +66,7 @@ def mean_color(capture: Capture) -> Color:
     return red, green, blue
 
 
-def fitted_bands(model: ModelConfig, num_frames: int) -> int:
+def determined_bands(model: ModelConfig, num_frames: int) -> int:
     """Number of frequencies of time for a capture, at most ``model.time_bands`` and at least 1 of them.
 
     See ``ModelConfig.min_period``.

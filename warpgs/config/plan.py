@@ -1,0 +1,40 @@
+"""What runs: a config whose values are all known."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+from .options import TrainConfig
+
+Device = Literal["cuda", "cpu"]
+"""Type of device."""
+
+Color = tuple[float, float, float]
+"""Red, green and blue in [0, 1]."""
+
+Background = Literal["black", "white"] | Color
+"""Colour behind all Gaussians."""
+
+
+@dataclass(frozen=True)
+class Plan(TrainConfig):
+    """What runs: a config, with the values that depend on the capture and on the machine, and a rescaled schedule.
+
+    ``initialization.plan.make_plan`` makes it for a new run; ``runs.config_file`` reads it for one that was begun. It
+    can be used as a config. What needs a value that was looked up takes a plan, and no config.
+
+    Attributes:
+        branches_in_stage2: Whether stage II compares the images of the single branches.
+    """
+
+    iterations: None = None
+    device: Device = field(kw_only=True)
+    background: Background = field(kw_only=True)
+    branches_in_stage2: bool = field(kw_only=True)
+
+    @staticmethod
+    def of(config: TrainConfig, device: Device, background: Background, branches_in_stage2: bool) -> "Plan":
+        """The plan of a config whose schedule is rescaled already."""
+        values = {name.name: getattr(config, name.name) for name in dataclasses.fields(TrainConfig)}
+        values |= {"device": device, "background": background, "iterations": None}
+        return Plan(**values, branches_in_stage2=branches_in_stage2)
