@@ -295,14 +295,13 @@ def no_alignments() -> torch.Tensor:
 
 DEPTHS = np.linspace(1.0, 1.5, NUM)
 MASKS = [ball(depth) for depth in DEPTHS]
-NO_ERRORS = torch.zeros(NUM)
 
 
 @pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
 def test_views_without_depth_get_that_of_objects(resident_bytes):
     capture, alignments = capture_of(MASKS), no_alignments()
     views = views_of(capture, resident_bytes)
-    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS).num_views == NUM
+    assert fill_object_depth(CONFIG, capture, views, alignments, 0.0).num_views == NUM
     assert alignments.tolist() == [[1.0, 0.0]] * NUM
     expected = object_depth(capture)
     for k in range(NUM):
@@ -313,7 +312,7 @@ def test_views_without_depth_get_that_of_objects(resident_bytes):
 def test_static_depth_stays_and_objects_follow_its_alignment():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.where(static, 3.0, torch.nan))
     views, alignments = views_of(capture), torch.tensor([[0.5, -1.0]]).repeat(NUM, 1)
-    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS).num_views == NUM
+    assert fill_object_depth(CONFIG, capture, views, alignments, 0.0).num_views == NUM
     assert alignments.tolist() == [[0.5, -1.0]] * NUM
     expected = object_depth(capture)
     for k in range(NUM):
@@ -325,7 +324,7 @@ def test_static_depth_stays_and_objects_follow_its_alignment():
 
 def test_depth_that_cannot_be_aligned_is_not_mixed_with_that_of_objects():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.where(static, 3.0, torch.nan))
-    assert fill_object_depth(CONFIG, capture, views_of(capture), no_alignments(), NO_ERRORS).num_views == 0
+    assert fill_object_depth(CONFIG, capture, views_of(capture), no_alignments(), 0.0).num_views == 0
 
 
 NOT_ASKED_FOR = pytest.mark.parametrize(
@@ -343,13 +342,13 @@ NOT_ASKED_FOR = pytest.mark.parametrize(
 @NOT_ASKED_FOR
 def test_objects_get_no_depth_where_it_is_not_asked_for(config, change):
     capture = change(capture_of(MASKS))
-    assert fill_object_depth(config, capture, views_of(capture), no_alignments(), NO_ERRORS).num_views == 0
+    assert fill_object_depth(config, capture, views_of(capture), no_alignments(), 0.0).num_views == 0
 
 
 def test_known_depth_of_what_moves_is_kept():
     capture = capture_of(MASKS, inverse_depth=lambda static: torch.ones(static.shape))
     views, alignments = views_of(capture), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
-    assert fill_object_depth(CONFIG, capture, views, alignments, NO_ERRORS).num_views == 0
+    assert fill_object_depth(CONFIG, capture, views, alignments, 0.0).num_views == 0
     assert (views[0].inverse_depth == 1.0).all()
 
 
@@ -371,9 +370,7 @@ def misplaced(masks, shifts=SHIFTS) -> Capture:
 def filled(capture: Capture, error: float, resident_bytes: int = 1 << 30) -> tuple[int, np.ndarray, Views]:
     """The number of views changed, the depth of what moves in each view, and the views."""
     views, alignments = views_of(capture, resident_bytes), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
-    errors = torch.full((NUM,), error)
-    errors[3] = torch.inf  # a view with too few points
-    count = fill_object_depth(CONFIG, capture, views, alignments, errors).num_views
+    count = fill_object_depth(CONFIG, capture, views, alignments, error).num_views
     return count, np.array([float((1.0 / v.inverse_depth[~v.static_mask]).mean()) for v in views]), views
 
 
@@ -493,7 +490,7 @@ def test_views_that_are_not_aligned_keep_their_depth(blurred):
     alignments = torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
     alignments[1] = torch.nan
     views = views_of(blurred)
-    assert fill_object_depth(CONFIG, blurred, views, alignments, torch.full((NUM,), 0.05)).num_views == NUM - 1
+    assert fill_object_depth(CONFIG, blurred, views, alignments, 0.05).num_views == NUM - 1
     assert torch.allclose(views[1].inverse_depth, blurred.frame("001").inverse_depth, rtol=1e-3)
 
 
@@ -596,21 +593,21 @@ def test_training_warns_if_too_few_frames_show_an_object():
 @NOT_ASKED_FOR
 def test_unknown_depth_of_objects_is_no_warning_where_it_is_not_asked_for(config, change):
     capture = change(capture_of(with_cut_off(0)))
-    assert fill_object_depth(config, capture, views_of(capture), no_alignments(), NO_ERRORS).num_cut is None
+    assert fill_object_depth(config, capture, views_of(capture), no_alignments(), 0.0).num_cut is None
 
 
 @pytest.mark.parametrize("error", [0.0, 0.15])
 def test_known_depth_of_objects_that_the_border_cuts_off_is_no_warning(error):
     capture = misplaced(with_cut_off(0))
     alignments = torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
-    found = fill_object_depth(CONFIG, capture, views_of(capture), alignments, torch.full((NUM,), error))
+    found = fill_object_depth(CONFIG, capture, views_of(capture), alignments, error)
     assert found == ObjectDepth(0)
 
 
 def test_depth_of_static_surfaces_alone_leaves_that_of_objects_unknown():
     static_depth = {"inverse_depth": lambda static: torch.where(static, 1.0 / WALL, torch.nan)}
     capture, alignments = capture_of(with_cut_off(0), **static_depth), torch.tensor([[1.0, 0.0]]).repeat(NUM, 1)
-    assert fill_object_depth(CONFIG, capture, views_of(capture), alignments, NO_ERRORS) == ObjectDepth(0, NUM)
+    assert fill_object_depth(CONFIG, capture, views_of(capture), alignments, 0.0) == ObjectDepth(0, NUM)
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,11 @@ from warpgs.config import RenderSettings
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture, Frame
 from warpgs.initialization import tracks as module
-from warpgs.initialization.plan import make_plan
+from warpgs.initialization.prepare_start import prepare_again, prepare_start
 from warpgs.initialization.silhouettes import Region
 from warpgs.initialization.tracked_start import MAX_FINAL_RATE, MAX_RATE
 from warpgs.initialization.tracks import _divided, find_tracks
+from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import render
 from warpgs.synthetic.balls import RADIUS, BallsSize, _balls, balls_capture
 
@@ -153,31 +154,37 @@ def test_too_few_frames_are_not_tracked(tmp_path):
 
 @pytest.mark.parametrize("preset", ["best", "quick"])
 def test_the_config_follows_tracks_from_the_start(capture, tracks, preset):
-    found, notes = make_plan(PRESETS[preset], capture)
+    start = prepare_start(dataclasses.replace(PRESETS[preset], device="cpu"), capture)
+    found = start.plan
     assert (found.model.deformation, found.model.paths) == ("splines", 5)
     assert found.model.path_points == len(tracks[0].path.c)
     assert (found.schedule.deform_from, found.schedule.noise_until) == (0, 0)
     assert found.optim.networks == MAX_RATE
     assert found.optim.networks_end == min(MAX_FINAL_RATE, PRESETS[preset].optim.networks_end)
-    assert "5 objects move far from frame to frame: dynamic Gaussians start on their tracks" in notes
+    assert "5 objects move far from frame to frame: dynamic Gaussians start on their tracks" in start.notes
+    assert isinstance(start.scene.deformation, SplineDeformation)
 
 
 def test_the_paper_starts_without_tracks(capture):
-    assert make_plan(PRESETS["paper"], capture)[0].model.deformation == "mlp"
+    assert prepare_start(dataclasses.replace(PRESETS["paper"], device="cpu"), capture).plan.model.deformation == "mlp"
+
+
+def test_a_run_that_was_begun_without_tracks_goes_on_without_them(capture):
+    assert prepare_again(plain.plan(PRESETS["quick"]), capture).plan.model.deformation == "mlp"
 
 
 def test_tracks_can_be_switched_off(capture):
     model = dataclasses.replace(PRESETS["quick"].model, tracks=False)
-    assert make_plan(dataclasses.replace(PRESETS["quick"], model=model), capture)[0].model.deformation == "mlp"
-    model = dataclasses.replace(model, deformation="splines")
+    config = dataclasses.replace(PRESETS["quick"], device="cpu", model=model)
+    assert prepare_start(config, capture).plan.model.deformation == "mlp"
     with pytest.raises(ValueError, match="splines"):
-        make_plan(dataclasses.replace(PRESETS["quick"], model=model), capture)
+        prepare_start(dataclasses.replace(config, model=dataclasses.replace(model, deformation="splines")), capture)
 
 
 def test_splines_are_refused_where_nothing_is_tracked(tmp_path):
     config = plain.config(model=dataclasses.replace(plain.config().model, deformation="splines"))
     with pytest.raises(ValueError, match="no small objects are tracked"):
-        make_plan(config, load_capture(tiny.write(tmp_path)))
+        prepare_start(config, load_capture(tiny.write(tmp_path)))
 
 
 @pytest.fixture

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
-from warpgs.data.depth_alignment import typical_error
 from warpgs.views.views import Views
 
 from .averaged_depth import average_depths
@@ -51,7 +50,7 @@ def fill_object_depth(
     capture: Capture,
     views: Views,
     alignments: Float[Tensor, "T 2"],
-    errors: Float[Tensor, " T"],
+    error: float,
 ) -> ObjectDepth:
     """Gives views the depth of objects that keep their size, where ``loss.object_depth`` asks for it.
 
@@ -63,14 +62,12 @@ def fill_object_depth(
         capture: The capture, with masks and static points.
         views: Its training views; the depth of dynamic pixels is changed.
         alignments: [T, 2] scale and offset of each view's inverse depth; set to 1 and 0 for views that had none.
-        errors: [T] relative error of each view's depth at the sparse points, aligned by a scale and an offset alone;
-            infinite if not aligned.
+        error: Typical relative error of the depth at the sparse points, aligned by a scale and an offset alone.
     """
     if not (config.loss.object_depth and config.depth and capture.assumption == "masks"):
         return ObjectDepth(0)
     if not is_depth_known(views, alignments):
         return _set_depths(capture, views, alignments)
-    error = float(typical_error(errors))
     if capture.metric_depth or error <= MIN_ERROR:
         return ObjectDepth(0)
     weight = 1.0 / (1.0 + (error / SIZE_ERROR) ** 2)

@@ -10,9 +10,6 @@ from warpgs.data.capture import COLORS, Capture, background_color
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.runtime.devices import choose_device
 
-from .tracked_start import for_tracks
-from .tracks import find_tracks
-
 MAX_AVERAGED = 50
 """Maximum number of frames whose mean colour is the background."""
 
@@ -21,25 +18,17 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
     """The plan of a new run, and sentences on what was looked up.
 
     Raises:
-        ValueError: If a number of the config is out of its range, there is no such device, or it names a deformation
-            model that the capture does not suit.
+        ValueError: If a number of the config is out of its range, or there is no such device.
     """
     config, notes = scaled(config), []
     background, loss = _background(config, capture), config.loss
-    seen = capture.assuming(config.assume).over(background)
-    tracks = find_tracks(seen) if config.model.tracks and config.model.deformation in ("mlp", "splines") else []
-    if tracks:
-        notes.append(f"{len(tracks)} objects move far from frame to frame: dynamic Gaussians start on their tracks")
-        config = for_tracks(config, tracks)
-    elif config.model.deformation == "splines":
-        raise ValueError('model.deformation "splines": no small objects are tracked in this capture; use "mlp"')
     asked, num = config.model.time_bands, len(capture.train)
     bands = determined_bands(config.model, num)
     if bands < asked:
         notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} frames determine no more")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
     branches = loss.branches_in_stage2 != "no"
-    if loss.branches_in_stage2 == "given-masks" and seen.uses_estimated_masks:
+    if loss.branches_in_stage2 == "given-masks" and capture.assuming(config.assume).uses_estimated_masks:
         notes.append("the masks are estimates: stage II compares the image of all Gaussians only, not each branch's")
         branches = False
     return Plan.of(config, choose_device(config.device), background, branches), notes

@@ -6,20 +6,22 @@ import torch
 
 from warpgs.config import Plan, TrainConfig
 from warpgs.data.capture import Capture
+from warpgs.data.depth_alignment import typical_error
 from warpgs.data.dynamic_regions import dynamic_counts, unknown_depth
 from warpgs.data.empty_masks import wrongly_empty
 from warpgs.errors import command
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime import ranks
-from warpgs.runtime.random_numbers import random_numbers
 from warpgs.views.views import Views
 
 from .alignment import DepthTrust, align_to_points, require_no_depth
 from .exposure import exposure_gains
-from .initialize import fits_motion, initial_scene
+from .initialize import fits_motion
 from .object_depth import fill_object_depth
 from .plan import make_plan
-from .start import Remedy, Start
+from .start import Remedy, Start, first_scene
+from .tracked_start import for_tracks
+from .tracks import find_tracks
 
 NO_DEPTH = "training without depth, and without the pretraining that needs it"
 
@@ -38,12 +40,12 @@ def prepare_start(config: TrainConfig, capture: Capture) -> Start:
             an unknown value or one that the capture does not suit.
     """
     plan, notes = make_plan(config, capture)
-    return _with_remedies(_read(plan, capture, notes))
+    return _with_remedies(_read(plan, capture, resumed=False).noted(*notes))
 
 
 def prepare_again(plan: Plan, capture: Capture) -> Start:
     """What a run starts from that was begun with a plan, before its checkpoint is restored; as ``prepare_start``."""
-    return _with_remedies(_read(plan, capture, []))
+    return _with_remedies(_read(plan, capture, resumed=True))
 
 
 def _with_remedies(start: Start) -> Start:
@@ -53,39 +55,52 @@ def _with_remedies(start: Start) -> Start:
     return start
 
 
-def _read(plan: Plan, capture: Capture, notes: list[str]) -> Start:
-    """The start before any remedy but that of exposure, which is divided out where images are decoded."""
+def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
+    """The start before any remedy."""
     capture = capture.assuming(plan.assume).over(plan.background)
     num, device = len(capture.train), torch.device(plan.device)
-    gains = exposure_gains(capture) if plan.exposure else torch.ones(num, 3, dtype=torch.float32)
-    jumps = (gains != 1.0).any(1)
     poses = PoseCorrections(num, capture.view_size).to(device) if plan.optim.poses else None
-    views = Views(
-        capture,
-        device,
-        plan.resident_bytes,
-        plan.loss.mask_margin,
-        gains if bool(jumps.any()) else None,  # saves steps a division
-        poses,
-        plan.graph,
-    )
+    views = Views(capture, device, plan.resident_bytes, plan.loss.mask_margin, poses, plan.graph)
     start = Start(
         plan,
         capture,
         views,
-        initial_scene(plan, capture, random_numbers(plan.seed, "points", 0, 0)),
+        first_scene(plan, capture),
         torch.full((num, 2), torch.nan, dtype=torch.float32, device=device),
-        torch.full((num,), torch.inf, dtype=torch.float32, device=device),
         DepthTrust(*torch.ones(2, num, dtype=torch.float32, device=device)),
-        notes=tuple(notes),
+        resumed,
     )
     if (cache := views.cache) is not None:
         read = "read from a file" if cache.fits else "decoded in every iteration: there is no space for a file"
         size = f"views of {cache.nbytes / 1e6:,.0f} MB exceed --resident-bytes or differ in size"
         start = start.noted(f"{size}; {read} in {cache.folder}")
-    if count := int(jumps.sum()):
-        low, high = gains.min().item(), gains.max().item()
-        start = start.noted(f"exposure jumps: {count} frames are divided by {low:.2f} to {high:.2f}")
+    return start
+
+
+def _even_exposure(start: Start) -> Start:
+    """Divides jumps of exposure out of the images."""
+    gains = exposure_gains(start.capture)
+    count = int((gains != 1.0).any(1).sum())
+    if not count:  # saves steps a division
+        return start
+    start.views.divide_by(gains)
+    low, high = gains.min().item(), gains.max().item()
+    return start.noted(f"exposure jumps: {count} frames are divided by {low:.2f} to {high:.2f}")
+
+
+def _may_be_tracked(start: Start) -> bool:
+    model = start.plan.model
+    return not start.resumed and (model.deformation == "splines" or (model.tracks and model.deformation == "mlp"))
+
+
+def _follow_tracks(start: Start) -> Start:
+    """Has dynamic Gaussians start on the tracks of objects that move far from frame to frame."""
+    tracks = find_tracks(start.capture) if start.plan.model.tracks else []
+    if tracks:
+        note = f"{len(tracks)} objects move far from frame to frame: dynamic Gaussians start on their tracks"
+        return start.planned(for_tracks(start.plan, tracks)).noted(note)
+    if start.plan.model.deformation == "splines":
+        raise ValueError('model.deformation "splines": no small objects are tracked in this capture; use "mlp"')
     return start
 
 
@@ -120,13 +135,14 @@ def _align_depth(start: Start) -> Start:
         notes.append(f"depth is off by {error:.1%} at the sparse points, its weight is {weight:.2f} (medians)")
     if refused:
         notes.append(f"depth of {refused} of {len(used)} views is hardly better than a constant and is not used")
-    start = replace(start, alignments=alignments, errors=found.plain_errors, trust=trust, num_aligned=num_aligned)
+    error = float(typical_error(found.plain_errors))
+    start = replace(start, alignments=alignments, trust=trust, num_aligned=num_aligned, depth_error=error)
     return start.noted(*notes)
 
 
 def _measure_objects(start: Start) -> Start:
     """Gives or corrects the depth of dynamic objects by their size."""
-    found = fill_object_depth(start.plan, start.capture, start.views, start.alignments, start.errors)
+    found = fill_object_depth(start.plan, start.capture, start.views, start.alignments, start.depth_error)
     start = replace(start, num_with_objects=found.num_views, num_cut=found.num_cut)
     num, notes = len(start.views), []
     if found.num_views:
@@ -160,6 +176,8 @@ def _fit_motion(start: Start) -> Start:
 
 
 REMEDIES = (
+    Remedy("exposure", lambda start: start.plan.exposure, _even_exposure),
+    Remedy("tracks", _may_be_tracked, _follow_tracks),
     Remedy("empty masks", _can_distrust_masks, _distrust_masks),
     Remedy("alignment of depth", lambda start: True, _align_depth),
     Remedy("depth by size", lambda start: start.plan.loss.object_depth, _measure_objects),

@@ -10,9 +10,11 @@ from torch import Tensor
 from warpgs.config import Plan
 from warpgs.data.capture import Capture
 from warpgs.model.scene import SplitScene
+from warpgs.runtime.random_numbers import random_numbers
 from warpgs.views.views import Views
 
 from .alignment import DepthTrust
+from .initialize import initial_scene
 
 
 @dataclass(frozen=True)
@@ -25,9 +27,10 @@ class Start:
         views: Its training views; remedies change their depth and the trust in their masks in place.
         scene: The initial scene.
         alignments: [T, 2] scale and offset of each view's inverse depth; NaN where it is unknown or not trusted.
-        errors: [T] relative error of each view's depth at the sparse points, aligned by a scale and an offset alone;
-            infinite if not aligned.
         trust: How much each view's depth is trusted.
+        resumed: Whether the plan is that of a run that was begun before: it stays as it is then.
+        depth_error: Typical relative error of depth at the sparse points, aligned by a scale and an offset alone; 0 if
+            none could be aligned.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
         num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
         num_cut: Number of views in which the border cuts dynamic objects off, if that leaves their depth unknown.
@@ -40,8 +43,9 @@ class Start:
     views: Views
     scene: SplitScene
     alignments: Float[Tensor, "T 2"]
-    errors: Float[Tensor, " T"]
     trust: DepthTrust
+    resumed: bool
+    depth_error: float = 0.0
     num_aligned: int = 0
     num_with_objects: int = 0
     num_cut: int | None = None
@@ -53,9 +57,18 @@ class Start:
         """Whether any view has depth to compare."""
         return self.num_aligned + self.num_with_objects > 0
 
+    def planned(self, plan: Plan) -> "Start":
+        """The same with another plan, and the initial scene that it implies."""
+        return replace(self, plan=plan, scene=first_scene(plan, self.capture))
+
     def noted(self, *notes: str) -> "Start":
         """The same, with more notes."""
         return replace(self, notes=(*self.notes, *notes))
+
+
+def first_scene(plan: Plan, capture: Capture) -> SplitScene:
+    """The initial scene of a plan."""
+    return initial_scene(plan, capture, random_numbers(plan.seed, "points", 0, 0))
 
 
 class Remedy(NamedTuple):

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from warpgs.config import TrainConfig
+from warpgs.config import Plan, TrainConfig
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.runtime import ranks
@@ -20,18 +20,18 @@ MAX_RATE, MAX_FINAL_RATE = 3e-4, 1e-5
 """Maximum initial and final learning rates of paths and networks; higher ones cost as docs/design/tracks.md says."""
 
 
-def for_tracks(config: TrainConfig, tracks: list[Track]) -> TrainConfig:
-    """The config of a training that starts from tracks: it follows them from its first iteration, at exact times."""
-    model, optim = config.model, config.optim
+def for_tracks(plan: Plan, tracks: list[Track]) -> Plan:
+    """The plan of a training that starts from tracks: it follows them from its first iteration, at exact times."""
+    model, optim = plan.model, plan.optim
     return dataclasses.replace(
-        config,
+        plan,
         model=dataclasses.replace(model, deformation="splines", paths=len(tracks), path_points=len(tracks[0].path.c)),
         optim=dataclasses.replace(
             optim,
             networks=min(MAX_RATE, optim.networks),
             networks_end=min(MAX_FINAL_RATE, optim.networks_end),
         ),
-        schedule=dataclasses.replace(config.schedule, deform_from=0, noise_until=0),
+        schedule=dataclasses.replace(plan.schedule, deform_from=0, noise_until=0),
     )
 
 

@@ -68,17 +68,18 @@ class ViewReader:
     Args:
         capture: Source of the frames.
         mask_margin: Half width of the borders of masks; see ``Views``.
-        gains: [T, 3] what images are divided by, per channel; nothing if None.
         pinned: Whether to read into pinned memory, from which CUDA copies without waiting.
 
     Attributes:
         cache: The file of decoded views; None if they are read only once.
+        gains: [T, 3] what images are divided by, per channel; nothing if None.
     """
 
-    def __init__(self, capture: Capture, mask_margin: float, gains: Float[Tensor, "T 3"] | None, pinned: bool) -> None:
-        self._capture, self._mask_margin, self._gains, self._pinned = capture, mask_margin, gains, pinned
+    def __init__(self, capture: Capture, mask_margin: float, pinned: bool) -> None:
+        self._capture, self._mask_margin, self._pinned = capture, mask_margin, pinned
         self._changed_depth: dict[int, Tensor] = {}  # of views for which the disk has no space
         self.cache: ViewCache | None = None
+        self.gains: Float[Tensor, "T 3"] | None = None
 
     def read(self, index: int) -> StoredView:
         """The view of an index; several threads may read at once.
@@ -89,7 +90,7 @@ class ViewReader:
         pixels = self._pixels(index)
         camera = self._capture.cameras[self._capture.train[index]]
         time = torch.tensor([camera.time], dtype=torch.float32)
-        gain = None if self._gains is None else self._gains[index]
+        gain = None if self.gains is None else self.gains[index]
         stored = StoredView(camera.viewmat, camera.K, time, *pixels, gain)
         return stored.map(Tensor.pin_memory) if self._pinned else stored
 

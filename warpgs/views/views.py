@@ -58,7 +58,6 @@ class Views:
         resident_bytes: Maximum memory for views on the device [bytes].
         mask_margin: Half width of the borders of masks, as a fraction of the image's larger side. Masks that are where
             frames are not empty have none: they are exact.
-        gains: [T, 3] what images are divided by, per channel; nothing if None.
         poses: Corrections of the cameras; none if None.
         graph: Whether work on the views may be captured in CUDA graphs.
 
@@ -82,13 +81,12 @@ class Views:
         device: torch.device,
         resident_bytes: int,
         mask_margin: float = 0.0,
-        gains: Float[Tensor, "T 3"] | None = None,
         poses: PoseCorrections | None = None,
         graph: bool = True,
     ) -> None:
         self.device, self.poses = device, poses
         self._capture, self.background = capture, capture.background
-        self._reader = ViewReader(capture, mask_margin, gains, pinned=device.type == "cuda")
+        self._reader = ViewReader(capture, mask_margin, pinned=device.type == "cuda")
         # New threads would use the first GPU, whatever the rank.
         setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
         self._read_ahead, self._slot = ReadAhead(self._reader.read, setup), Slot(device)
@@ -160,6 +158,12 @@ class Views:
         if not self.resident:
             return self._view(self._slot.view, self.index)
         return self._view(self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index)
+
+    def divide_by(self, gains: Float[Tensor, "T 3"]) -> None:
+        """Divides images by a factor per channel; call it before any view is read ahead."""
+        self._reader.gains = gains
+        if self.resident:
+            self._all = self._all._replace(gain=gains.to(self.device))
 
     def set_depth_factor(self, index: int, alignment: Float[Tensor, "2"], factor: Float[Tensor, "H W"]) -> None:
         """Multiplies the aligned inverse depth of a view by a factor, once; the alignment stays the same."""
