@@ -292,6 +292,12 @@ def test_texts_from_a_run_folder_are_escaped(tmp_path, run, made):
     assert EVIL in page.words
 
 
+def test_a_report_shows_what_was_noted_before_the_first_step(tmp_path, run):
+    notes = ["depth is off by 1.0% at the sparse points", "the capture has no masks"]
+    edit_json(run / "metrics.json", notes=notes)
+    assert "; ".join(notes) in report(tmp_path, run, views=0).words
+
+
 def test_tags_of_curves_are_escaped():
     svg = chart(EVIL, EVIL, [Series(EVIL, "red", [(0.0, 1.0), (1.0, 2.0)])])
     page = Page(svg)

@@ -16,7 +16,7 @@ from warpgs.config.presets import PRESETS
 from warpgs.locks import lock_folder
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs
-from warpgs.runs.config_file import read_config
+from warpgs.runs.config_file import read_config, read_notes, write_start
 from warpgs.runs.run import Run, locked_new_folder, new_folder, open_run
 from warpgs.runtime.devices import choose_device
 from warpgs.training.schedule import Protocol
@@ -57,6 +57,15 @@ def edit(run, change):
 def test_a_plan_round_trips(tmp_path, capture, config):
     config = dataclasses.replace(config, out=tmp_path / "run", data=tmp_path)
     assert read_config(create(config, capture)) == plain.plan(config)
+
+
+def test_damaged_notes_are_refused_by_the_name_of_their_file(run):
+    assert read_notes(run) is None
+    write_start(run, tiny.CONFIG, ["a sentence"])
+    assert read_notes(run) == ["a sentence"]
+    (run / "start.json").write_text('{"notes": [1]}')
+    with pytest.raises(ValueError, match=r"start\.json is damaged: notes cannot be \[1\]"):
+        read_notes(run)
 
 
 def test_a_run_prints_as_what_was_trained_on_what(tmp_path, capture):

@@ -30,7 +30,7 @@ from warpgs.data.images import read_image
 from warpgs.evaluation import evaluate_run
 from warpgs.initialization import prepare_start
 from warpgs.runs import checkpoint
-from warpgs.runs.config_file import read_config
+from warpgs.runs.config_file import parse_config, read_config
 from warpgs.runs.run import Run
 from warpgs.synthetic.room import BuiltinScene, builtin_capture
 from warpgs.training import train as script
@@ -150,6 +150,19 @@ def test_a_run_writes_its_resolved_config(finished):
     schedule = config["schedule"]
     assert schedule["pretrain"] + schedule["stage1"] + schedule["stage2"] == 40
     assert config["device"] == "cpu"
+
+
+def test_a_run_keeps_its_config_as_it_was_asked_for(finished):
+    start = json.loads((finished[1] / "start.json").read_text())
+    asked = parse_config(start["asked"], "start.json")
+    assert (asked.iterations, read_config(finished[1]).iterations) == (40, None)
+    assert (asked.schedule, asked.background) == (PRESETS["quick"].schedule, "mean")
+
+
+def test_a_run_keeps_in_its_metrics_what_was_noted_before_the_first_step(finished):
+    notes = json.loads((finished[1] / "metrics.json").read_text())["notes"]
+    assert any(note.startswith("depth is off by ") for note in notes)
+    assert all(note in finished[0].stdout for note in notes)
 
 
 def test_a_finished_run_can_be_evaluated_again(finished, capsys, monkeypatch):

@@ -6,13 +6,14 @@ from typing import Any
 import torch
 
 from warpgs.command_line.progress import progress
-from warpgs.config import NetName
+from warpgs.config import Device, NetName
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.files import read_json, write_json, write_png
 from warpgs.rendering import Rendering
 from warpgs.runs.captures import require_same_times
-from warpgs.runs.run import MASK_TRIAL, Device, Run
+from warpgs.runs.config_file import read_notes
+from warpgs.runs.run import MASK_TRIAL, Run
 from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import replay
 from warpgs.video.writer import Video
@@ -62,6 +63,7 @@ def evaluate_run(
     # First, because opening a capture can take a minute.
     network = find(lpips[0] or run.config.lpips, lpips[1] or run.config.lpips_net)
     trial = read_json(folder / MASK_TRIAL) if (folder / MASK_TRIAL).exists() else {}
+    notes = read_notes(folder)
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     require_same_times(capture, scene.metadata)
@@ -69,7 +71,7 @@ def evaluate_run(
     network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
     evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), "device": device_name(scene.device), **_of_run(scene, capture)}
-    _write_metrics(run, {**trial, **values, "commit": commit()}, evaluation)
+    _write_metrics(run, {**trial, **values, "commit": commit(), "notes": notes}, evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     run.require_present()
     return _summary(values)

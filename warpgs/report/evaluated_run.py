@@ -102,7 +102,7 @@ def _read(label: str, folder: Path) -> EvaluatedRun:
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:
-    """The content of metrics.json of a run folder: numbers, texts, yes or no, and None where not measured.
+    """The content of metrics.json of a run folder: numbers, texts, lists of texts, yes or no; None where not measured.
 
     Raises:
         ValueError: If the run was not evaluated, or the file is damaged; the message names it.
@@ -110,10 +110,11 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     path = folder / "metrics.json"
     _check_evaluated(path)
     values = read_json(path, max_bytes=MAX_FILE)
-    if any(isinstance(value, dict | list) for value in values.values()):
+    texts = [text for value in values.values() if isinstance(value, list) for text in value]
+    if any(isinstance(value, dict) for value in values.values()) or not all(isinstance(text, str) for text in texts):
         raise ValueError(f"{path} is damaged: expected an object with numbers and strings")
     for name, value in values.items():
-        is_text = isinstance(value, str) and name in METRICS
+        is_text = isinstance(value, str | list) and name in METRICS
         if is_text or (isinstance(value, int | float) and not abs(value) <= MAX_VALUE):
             raise ValueError(f"{path} is damaged: {reprlib.repr(name)} cannot be {reprlib.repr(value)}")
     return values

@@ -12,6 +12,7 @@ from .evaluated_run import EvaluatedRun
 TITLES = {
     "device": "FPS measured on",
     "lpips_net": "LPIPS network",
+    "notes": "noted before the first step",
     "num_views": "views",
     "poses_aligned": "held-out cameras aligned",
     "train_seconds": "training time [h:m:s]",
@@ -56,6 +57,8 @@ def formatted(name: str, value: Any) -> str:
         return "not measured"
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if isinstance(value, list):
+        return "; ".join(value) or "none"
     if not isinstance(value, int | float):
         return str(value)
     if name in ("train_seconds", "mask_trial_seconds"):

@@ -1,10 +1,11 @@
-"""config.json of a run folder: its plan, written and read back."""
+"""config.json of a run folder: its plan, written and read back; and start.json: what was asked for and noted before."""
 
 import dataclasses
 import json
 import reprlib
 import sys
 import typing
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from warpgs.errors import missing, suggestion
 from warpgs.files import read_json, write_text
 from warpgs.runtime.devices import choose_device
 
-NAME = "config.json"
+NAME, START = "config.json", "start.json"
 MAX_BYTES = 1 << 20
 """Size of config.json [bytes]."""
 
@@ -109,10 +110,41 @@ def write_config(folder: Path, config: Plan) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
+    _write(folder / NAME, _with_absolute_paths(dataclasses.replace(config, out=folder)))
+
+
+def write_start(folder: Path, asked: TrainConfig, notes: Sequence[str]) -> None:
+    """Writes start.json into a run folder: the config as it was asked for, and what was noted before the first step.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    _write(folder / START, {"asked": _with_absolute_paths(asked), "notes": list(notes)})
+
+
+def read_notes(folder: Path) -> list[str] | None:
+    """What was noted before the first step; None for runs of version 0.3 and earlier, which have no start.json.
+
+    Raises:
+        ValueError: If the file is damaged; the message names it.
+    """
+    if not (folder / START).exists():
+        return None
+    notes = read_json(folder / START, max_bytes=MAX_BYTES).get("notes")
+    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
+        raise ValueError(f"{folder / START} is damaged: notes cannot be {reprlib.repr(notes)}")
+    return notes
+
+
+def _with_absolute_paths(config: TrainConfig) -> dict[str, Any]:
+    """The fields of a config, with absolute paths of the capture and of weights."""
     data = config.data if config.data is None or is_builtin(config.data) else config.data.resolve()
     weights = config.lpips and config.lpips.resolve()
-    plain = dataclasses.asdict(dataclasses.replace(config, out=folder, data=data, lpips=weights))
-    write_text(folder / NAME, json.dumps(plain, indent=2, default=_as_json) + "\n")
+    return dataclasses.asdict(dataclasses.replace(config, data=data, lpips=weights))
+
+
+def _write(path: Path, values: dict[str, Any]) -> None:
+    write_text(path, json.dumps(values, indent=2, default=_as_json) + "\n")
 
 
 def _as_json(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Run folders: config.json, mask_trial.json, checkpoints/, events/, metrics.json, views.csv, images/, time.mp4."""
+"""Run folders: opened and created; docs/run-folder.md lists their files."""
 
 import dataclasses
 import os

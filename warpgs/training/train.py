@@ -21,7 +21,7 @@ from warpgs.initialization.prepare_start import prepare_again, prepare_start
 from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
-from warpgs.runs.config_file import read_config, write_config
+from warpgs.runs.config_file import read_config, write_config, write_start
 from warpgs.runs.run import MASK_TRIAL, Run, locked_new_folder
 from warpgs.runtime import ranks
 from warpgs.runtime.devices import choose_device
@@ -211,6 +211,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None, locks: contextlib.
 
 def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitStack) -> Trainer:
     """The trainer of a new run."""
+    asked = config
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
     _check_precision(config)
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
@@ -223,7 +224,10 @@ def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitSta
     config, trial = with_trusted_masks(config, capture, log, quiet)
     trainer = Trainer(prepare_start(config, capture), Path(ranks.text_of_first(folder)))
     if ranks.is_first():
-        Run.create(trainer.run, trainer.config)  # last: the folder of a run that is refused before is removed again
+        run = Run.create(
+            trainer.run, trainer.config
+        )  # last: the folder of a run that is refused before is removed again
+        write_start(run.folder, asked, trainer.notes)
         if trial:
             write_json(trainer.run / MASK_TRIAL, trial)
     return trainer
