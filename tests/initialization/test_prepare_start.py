@@ -20,35 +20,27 @@ def capture(data):
 
 
 def test_remedies_that_apply_change_the_start_in_their_order(capture, monkeypatch):
-    remedies = (
-        Remedy("first", lambda start: True, lambda start: start.noted("first")),
-        Remedy("unneeded", lambda start: "first" not in start.notes, lambda start: start.noted("unneeded")),
-        Remedy("last", lambda start: "first" in start.notes, lambda start: start.noted("last")),
-    )
+    remedies = {
+        "a": Remedy(lambda start: True, lambda start: start.noted("first")),
+        "b": Remedy(lambda start: "first" not in start.notes, lambda start: start.noted("unneeded")),
+        "c": Remedy(lambda start: "first" in start.notes, lambda start: start.noted("last")),
+    }
     monkeypatch.setattr(module, "REMEDIES", remedies)
     assert prepare_start(tiny.CONFIG, capture).notes == ("first", "last")
 
 
-def test_remedies_have_names_of_their_own():
-    names = [remedy.name for remedy in module.REMEDIES]
-    assert len(set(names)) == len(names)
-
-
-def remedy(name):
-    (found,) = (remedy for remedy in module.REMEDIES if remedy.name == name)
-    return found
-
-
 def test_empty_masks_are_found_without_decoding_frames_again(capture):
     start, read = prepare_start(tiny.CONFIG, capture), Mock()
-    remedy("empty masks").apply(dataclasses.replace(start, capture=dataclasses.replace(start.capture, read=read)))
+    module.REMEDIES["empty masks"].apply(
+        dataclasses.replace(start, capture=dataclasses.replace(start.capture, read=read))
+    )
     read.assert_not_called()
 
 
 @pytest.mark.parametrize("assume", ["static", "dynamic"])
 def test_masks_that_are_not_used_are_not_doubted(capture, assume):
     start = prepare_start(dataclasses.replace(tiny.CONFIG, assume=assume), capture)
-    assert not remedy("empty masks").applies(start)
+    assert not module.REMEDIES["empty masks"].applies(start)
 
 
 def test_a_jump_of_exposure_is_divided_out_of_the_views_and_noted(capture, monkeypatch):

@@ -49,7 +49,7 @@ def prepare_again(plan: Plan, capture: Capture) -> Start:
 
 
 def _with_remedies(start: Start) -> Start:
-    for remedy in REMEDIES:
+    for remedy in REMEDIES.values():
         if remedy.applies(start):
             start = remedy.apply(start)
     return start
@@ -175,13 +175,13 @@ def _fit_motion(start: Start) -> Start:
     return replace(start, fits_motion=True)
 
 
-REMEDIES = (
-    Remedy("exposure", lambda start: start.plan.exposure, _even_exposure),
-    Remedy("tracks", _may_be_tracked, _follow_tracks),
-    Remedy("empty masks", _can_distrust_masks, _distrust_masks),
-    Remedy("alignment of depth", lambda start: True, _align_depth),
-    Remedy("depth by size", lambda start: start.plan.loss.object_depth, _measure_objects),
-    Remedy("lack of depth", _lacks_depth, _do_without_depth),
-    Remedy("motion fit", lambda s: fits_motion(s.plan, s.capture, s.views, s.alignments), _fit_motion),
-)
-"""What is done before training, in this order."""
+REMEDIES: dict[str, Remedy] = {
+    "exposure": Remedy(lambda start: start.plan.exposure, _even_exposure),
+    "tracks": Remedy(_may_be_tracked, _follow_tracks),
+    "empty masks": Remedy(_can_distrust_masks, _distrust_masks),
+    "alignment of depth": Remedy(lambda start: True, _align_depth),
+    "depth by size": Remedy(lambda start: start.plan.loss.object_depth, _measure_objects),
+    "lack of depth": Remedy(_lacks_depth, _do_without_depth),
+    "motion fit": Remedy(lambda s: fits_motion(s.plan, s.capture, s.views, s.alignments), _fit_motion),
+}
+"""Remedies by name, in the order in which they are applied before training."""

@@ -75,11 +75,9 @@ class Remedy(NamedTuple):
     """A remedy for what a capture lacks.
 
     Attributes:
-        name: Its name, for messages and tests.
         applies: Whether it is asked for and of use.
         apply: The start after it.
     """
 
-    name: str
     applies: Callable[[Start], bool]
     apply: Callable[[Start], Start]
