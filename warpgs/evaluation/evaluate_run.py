@@ -62,8 +62,7 @@ def evaluate_run(
     run = Run.open(folder, device)
     # First, because opening a capture can take a minute.
     network = find(lpips[0] or run.config.lpips, lpips[1] or run.config.lpips_net)
-    trial = read_json(folder / MASK_TRIAL) if (folder / MASK_TRIAL).exists() else {}
-    notes = read_notes(folder)
+    known = (read_json(folder / MASK_TRIAL) if (folder / MASK_TRIAL).exists() else {}) | {"notes": read_notes(folder)}
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     require_same_times(capture, scene.metadata)
@@ -71,7 +70,7 @@ def evaluate_run(
     network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
     evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)
     values = {**evaluation.summary(), "device": device_name(scene.device), **_of_run(scene, capture)}
-    _write_metrics(run, {**trial, **values, "commit": commit(), "notes": notes}, evaluation)
+    _write_metrics(run, {**known, **values, "commit": commit()}, evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
     run.require_present()
     return _summary(values)
