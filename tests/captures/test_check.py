@@ -147,7 +147,7 @@ def test_training_frames_need_masks_and_evaluation_frames_do_not_as_in_training(
     assert report.is_fit == (text == "")
     assert texts(report, "error").startswith(text)
     assert f"{len(masked)} of 12 frames have masks" in texts(report, "note")
-    views = ViewReader(load_capture(root), 0.0, None, pinned=False)
+    views = ViewReader(load_capture(root), 0.0, pinned=False)
     refused = pytest.raises(ValueError, match="has no mask") if text else contextlib.nullcontext()
     with refused:
         for k in range(11):
