@@ -115,7 +115,9 @@ def test_the_size_of_any_shape_is_that_of_each_gaussian():
 
 @pytest.mark.parametrize("unit", ["extent", "pixel"])
 def test_static_needles_alone_are_shortened_in_the_unit_of_densification(data, tmp_path, unit):
-    densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, max_size=0.5, unit=unit)
+    densify_config = dataclasses.replace(
+        tiny.CONFIG.densify, max_elongation=10.0, max_size=0.5, split_size=0.01, unit=unit
+    )
     trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config))
     needles, extent = make_gaussians([SIZE]), trainer.capture.extent
     needles.log_scales.data = torch.tensor([[0.001, 9.0, 0.001]]).log()
