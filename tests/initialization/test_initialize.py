@@ -9,7 +9,7 @@ import torch
 from tests import plain, tiny
 from tests.scenes import HEIGHT, WIDTH, error, generator, make_camera
 from warpgs.data.capture import Capture, Frame
-from warpgs.initialization import alignment, dynamic_points, initialize
+from warpgs.initialization import alignment, dynamic_points, initialize, motion_fit
 from warpgs.initialization.point_cloud import (
     color_points,
     distinct,
@@ -524,6 +524,16 @@ def test_a_fit_of_the_deformation_which_takes_a_while_is_announced(data, tmp_pat
     assert trainer._add_dynamic_gaussians(logger=logger)
     lines = [call.args[0] for call in logger.log.call_args_list]
     assert lines == ["before stage I, 2 steps fit the deformation to points on what moves"] * (steps > 0)
+
+
+def test_a_fit_of_the_deformation_that_is_not_used_is_told(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(motion_fit, "MIN_KEPT", 1.1)
+    schedule = dataclasses.replace(tiny.SCHEDULE, fit_motion=2)
+    trainer = tiny.trainer(data, tmp_path / "run", dataclasses.replace(tiny.CONFIG, schedule=schedule))
+    logger = Mock(spec=TrainingLogger)
+    assert trainer._add_dynamic_gaussians(logger=logger)
+    assert logger.log.call_args.args[0].startswith("warning: no deformation follows what moves")
+    assert len(trainer.scene.dynamic)
 
 
 def test_if_everything_is_assumed_static_there_are_no_dynamic_gaussians():

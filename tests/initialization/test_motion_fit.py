@@ -136,7 +136,7 @@ def test_repetitions_change_neither_the_distance_of_a_view_nor_its_gradient():
 def test_the_distance_is_the_mean_over_all_points_of_that_to_the_nearest_one():
     deformed, seen = (torch.randn(num, 6, generator=generator(num)) for num in (50, 30))
     squared = torch.cdist(deformed.double(), seen.double()).square()
-    found, hidden = (9.0 * nearest / (9.0 + nearest) for nearest in (squared.amin(0), squared.amin(1)))
+    found, hidden = (9.0 * (1.0 + nearest / 9.0).log() for nearest in (squared.amin(0), squared.amin(1)))
     expected = found.mean() + motion_fit.HIDDEN_WEIGHT * hidden.mean()
     for repetitions in (0, 1, 30, 47):
         repeated = torch.cat([seen, seen, seen])[: 30 + repetitions]
@@ -161,6 +161,30 @@ def test_an_object_that_no_canonical_frame_shows_keeps_its_points(x):
     for view in (16, 20):
         seen = points.positions[(points.views == view) & (points.colors == 0.5).all(1)]
         assert torch.cdist(deformed(deformation, grey, view), seen).amin(1).max() <= MAX_ERROR * VIEW_SIZE
+
+
+@pytest.mark.parametrize("distance", [3.0, 10.0, 30.0, 100.0])
+def test_a_point_is_pulled_towards_an_object_however_far_it_is(distance):
+    deformed = torch.tensor([[distance, 0.0, 0.0, 0.0, 0.0, 0.0]]).requires_grad_()
+    motion_fit._distance(deformed, torch.zeros(1, 6), torch.tensor(1)).backward()
+    assert deformed.grad[0, 0] * distance > 10.0  # a robust distance that has a limit ends at 0
+
+
+class Collapsed(torch.nn.Module):
+    """It moves everything to one place."""
+
+    def __init__(self):
+        super().__init__()
+        self.place = torch.nn.Parameter(torch.zeros(3))
+
+    def forward(self, means, time):
+        return torch.cat([self.place - means, means.new_zeros(len(means), 7)], 1)
+
+
+def test_a_fit_that_explains_few_points_is_not_used():
+    deformation = Collapsed()
+    assert fit(FOUND, deformation, 20) is FOUND
+    assert torch.equal(deformation.place, torch.zeros(3))
 
 
 def test_points_that_the_deformation_does_not_reach_are_dropped():

@@ -31,8 +31,9 @@ WINDOW = 0.015
 POSITION_UNIT, COLOR_UNIT = 0.019, 0.15
 """Differences of positions, as a fraction of the view size, and of colours in [0, 1] that count as 1."""
 
-MAX_SQUARED_DISTANCE = 9.0
-"""Limit that squared distances approach (Geman and McClure): frames see sides that others do not."""
+SQUARED_SCALE = 9.0
+"""Squared distance from which on distances count less and less (Cauchy): frames see sides that others do not. They never
+count nothing, so that the deformation still follows an object whose depth is unknown for many frames."""
 
 HIDDEN_WEIGHT = 0.3
 """Weight of the distances of canonical points, which a frame need not see, to the nearest of the frame's points,
@@ -51,6 +52,9 @@ the same where an object turns as a whole."""
 
 MAX_ERROR = 0.011
 """Maximum distance of a deformed point from where it was seen, as a fraction of the view size."""
+
+MIN_KEPT = 0.3
+"""Fraction of the points that a fitted deformation has to move to where they were seen, or it is not used."""
 
 
 def fit_motion(
@@ -78,8 +82,9 @@ def fit_motion(
         is_stopped: Asked after each step whether to stop.
 
     Returns:
-        Those of the points that are deformed to where they were seen, at their canonical positions; None, and the
-        deformation as it was, if stopped.
+        Those of the points that are deformed to where they were seen, at their canonical positions; if they are fewer
+        than ``MIN_KEPT``, all points where they were seen, and the deformation as it was; None, and the deformation as
+        it was, if stopped.
     """
     # In half precision, the network of one of six seeds learned nothing on builtin:studio without depth.
     fitted = in_single_precision(copy.deepcopy(deformation).requires_grad_(True))
@@ -89,8 +94,11 @@ def fit_motion(
     points = _PointsByView(found, times, view_size, device, generator)
     if not _fit(fitted, points, config, generator, is_stopped):
         return None
+    kept = points.canonical(fitted, found, config.graph and device.type == "cuda")
+    if len(kept.positions) < MIN_KEPT * len(found.positions):
+        return found
     deformation.load_state_dict(fitted.state_dict())
-    return points.canonical(fitted, found, config.graph and device.type == "cuda")
+    return kept
 
 
 def _fit(
@@ -231,7 +239,7 @@ class _PointsByView:
         """Canonical positions [scene units] of points seen at a time, and which of them to keep; see ``canonical``."""
         deformed, max_error = self.deformed(deformation, time), self.max_error
         distances, nearest = torch.cdist(seen, deformed).min(1)
-        is_shown = distances.square() <= MAX_SQUARED_DISTANCE
+        is_shown = distances.square() <= SQUARED_SCALE
         goal, home = seen[:, :3] * self.unit, self.home[nearest, :3] * self.unit
         away = goal - deformed[nearest, :3] * self.unit
         start = home + away
@@ -266,4 +274,4 @@ def _distance(
 
 
 def _robust(squared: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
-    return MAX_SQUARED_DISTANCE * squared / (MAX_SQUARED_DISTANCE + squared)
+    return SQUARED_SCALE * torch.log1p(squared / SQUARED_SCALE)
