@@ -19,7 +19,8 @@ MIN_SCALE = 1e-7**0.5
 """Minimum standard deviation where sizes are not bounded; as in 3DGS [scene units]."""
 
 FEW_POINTS_SCALE = 0.01
-"""Standard deviation of Gaussians at so few points that their distances say nothing [scene units]."""
+"""Standard deviation of Gaussians at so few points that their distances say nothing [scene units]; where there is a
+maximum, it is half of that."""
 
 COINCIDENT = 1e-6
 """Distance between points that coincide, relative to the median of their largest coordinates: merged clouds contain
@@ -56,7 +57,8 @@ def gaussians_at(
     """
     first, place = distinct(points, resolution if model.bound_sizes else 0.0)
     if len(first) <= NUM_NEIGHBOURS:
-        scales = torch.full((points.shape[0],), min(FEW_POINTS_SCALE, max_scale), dtype=torch.float32)
+        scale = 0.5 * max_scale if math.isfinite(max_scale) else FEW_POINTS_SCALE
+        scales = torch.full((points.shape[0],), scale, dtype=torch.float32)
         return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, model.sh_degree)
     places = points[first].numpy()
     distances, _ = cKDTree(places).query(places, k=NUM_NEIGHBOURS + 1, workers=-1)
