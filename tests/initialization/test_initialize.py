@@ -181,6 +181,11 @@ def test_a_place_that_holds_most_points_does_not_change_the_sizes_elsewhere():
     assert error(among[50:], alone[:1].expand(5_000, 3)) < 1e-6
 
 
+def test_few_points_have_half_of_the_maximum_size():
+    few = gaussians_at(torch.randn(3, 3), torch.zeros(3, 3), NETWORK, 8.0)
+    assert few.scales.unique().tolist() == pytest.approx([4.0])
+
+
 @pytest.mark.parametrize("places", [1, 2, 3])
 def test_points_at_few_places_have_the_size_of_few_points(places):
     points = random_points(places)
@@ -560,13 +565,13 @@ def test_gaussians_of_unknown_depth_are_small_unless_sizes_are_unbounded(config,
 
 @pytest.mark.parametrize("deformation", ["mlp", "splines"])
 @pytest.mark.parametrize("unit", ["pixel", "extent"])
-def test_offsets_are_in_view_sizes_or_as_in_the_paper_in_scene_units(deformation, unit):
+def test_offsets_are_in_half_view_sizes_or_as_in_the_paper_in_scene_units(deformation, unit):
     model = dataclasses.replace(CONFIG.model, deformation=deformation)
     config = dataclasses.replace(CONFIG, model=model, densify=plain.densify(unit=unit, split_size=0.01))
     capture = make_capture(points_at([12, 2], [20, 20]))
     field = initialize.initial_scene(config, capture, generator()).deformation
     units = (field.network if deformation == "splines" else field).units
-    length = {"pixel": capture.view_size, "extent": 1.0}[unit]
+    length = {"pixel": capture.view_size / 2, "extent": 1.0}[unit]
     assert units.tolist() == pytest.approx([length] * 3 + [1.0] * 7)
 
 

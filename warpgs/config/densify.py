@@ -22,9 +22,9 @@ class DensifyConfig:
     unit: Literal["pixel", "extent"] = "pixel"
     """Unit of ``split_size`` and ``max_size``, which are standard deviations: a pixel of the nearest training view that
     has shown the Gaussian since the last densification, at its depth there; or the radius of the cameras' positions, as
-    in 3DGS (paper). Gaussians that no view has shown have any size in pixels. With pixel, errors of depth, offsets of
-    the deformation, ``loss.scale`` and ``noise`` are in view sizes of the capture (docs/glossary.md), else in scene
-    units."""
+    in 3DGS (paper). Gaussians that no view has shown have any size in pixels. With pixel, errors of depth,
+    ``loss.scale`` and ``noise`` are in view sizes of the capture (docs/glossary.md), and offsets of the deformation in
+    halves of it; else all are in scene units."""
     split_size: float = 2.0
     """Size above which a Gaussian is split instead of cloned."""
     min_opacity: float = 0.005

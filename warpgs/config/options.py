@@ -110,8 +110,12 @@ class TrainConfig:
         return RenderSettings(antialias=self.antialias, max_alpha=self.max_alpha)
 
     def length_unit(self, view_size: float) -> float:
-        """Length of 1 in the loss, the deformation and the noise [scene units], from a capture's view size."""
+        """Length of 1 in the loss and the noise [scene units], from a capture's view size."""
         return view_size if self.densify.unit == "pixel" else 1.0
+
+    def offset_unit(self, view_size: float) -> float:
+        """Length of 1 in the deformation [scene units]: half of a view, from the centre of an image to its border."""
+        return 0.5 * view_size if self.densify.unit == "pixel" else 1.0
 
 
 def validate(config: TrainConfig) -> None:

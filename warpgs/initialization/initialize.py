@@ -45,7 +45,7 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
         scene = SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
     for module in scene.deformation.modules():
         if isinstance(module, MlpDeformation):
-            module.units[:3] = config.length_unit(capture.view_size)
+            module.units[:3] = config.offset_unit(capture.view_size)
     return scene
 
 

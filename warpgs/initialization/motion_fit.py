@@ -32,8 +32,8 @@ POSITION_UNIT, COLOR_UNIT = 0.019, 0.15
 """Differences of positions, as a fraction of the view size, and of colours in [0, 1] that count as 1."""
 
 SQUARED_SCALE = 9.0
-"""Squared distance from which on distances count less and less (Cauchy): frames see sides that others do not. They never
-count nothing, so that the deformation still follows an object whose depth is unknown for many frames."""
+"""Squared distance from which on distances count less and less (Cauchy): frames see sides that others do not. However
+far an object is, it still pulls the deformation, which otherwise loses one whose depth is unknown for many frames."""
 
 HIDDEN_WEIGHT = 0.3
 """Weight of the distances of canonical points, which a frame need not see, to the nearest of the frame's points,

@@ -14,7 +14,7 @@ class MlpDeformation(nn.Module):
 
     Attributes:
         units: [10] by which the outputs of the network are multiplied: of positions the length that counts as 1
-            (``TrainConfig.length_unit``) [scene units], which the initial scene sets; 1 of the others.
+            (``TrainConfig.offset_unit``) [scene units], which the initial scene sets; 1 of the others.
     """
 
     units: Tensor

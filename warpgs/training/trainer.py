@@ -185,7 +185,7 @@ class Trainer:
             return False
         same = all(map(torch.equal, before, self.scene.deformation.parameters()))
         if logger is not None and self.protocol.fits_motion and same:
-            logger.log("warning: no deformation follows what moves: dynamic Gaussians start where each frame shows them")
+            logger.log("warning: no deformation follows what moves: dynamic Gaussians start where frames show them")
         self.scene.dynamic = found
         self._start_from(self.scene)
         return True
