@@ -68,8 +68,7 @@ def fit_motion(
 ) -> DynamicPoints | None:
     """Fits a deformation to dynamic points, and moves these to canonical space.
 
-    The points of the frames around one time are the canonical ones. They are deformed to the time of each other frame,
-    and the distances between them and the points of that frame are minimized.
+    The points around one time are canonical. Deformed to the time of each other frame, they come close to its points.
 
     Args:
         deformation: As ``fields.FIELDS`` says; its parameters are changed. One without parameters stays as it is.
@@ -82,9 +81,8 @@ def fit_motion(
         is_stopped: Asked after each step whether to stop.
 
     Returns:
-        Those of the points that are deformed to where they were seen, at their canonical positions; if they are fewer
-        than ``MIN_KEPT``, all points where they were seen, and the deformation as it was; None, and the deformation as
-        it was, if stopped.
+        Those of the points that are deformed to where they were seen, at their canonical positions; all points as found
+        if those are fewer than ``MIN_KEPT``, or None if stopped, and the deformation as it was.
     """
     # In half precision, the network of one of six seeds learned nothing on builtin:studio without depth.
     fitted = in_single_precision(copy.deepcopy(deformation).requires_grad_(True))
@@ -95,7 +93,7 @@ def fit_motion(
     if not _fit(fitted, points, config, generator, is_stopped):
         return None
     kept = points.canonical(fitted, found, config.graph and device.type == "cuda")
-    if len(kept.positions) < MIN_KEPT * len(found.positions):
+    if len(kept.views) < MIN_KEPT * len(found.views):
         return found
     deformation.load_state_dict(fitted.state_dict())
     return kept
