@@ -23,7 +23,6 @@ loss = partial(
         squared=0.0,
         acceleration=0.0,
         hidden_appearance=True,
-        dynamic_background="random",
         depth=2.0,
         depth_dynamic=1.0,
         branches_in_stage2="yes",

@@ -35,7 +35,6 @@ PAPER = {
         "model.paths": 1,  # of the deformation model "splines" alone, like the next
         "model.path_points": 4,
         "loss.dynamic": 1.0,
-        "loss.dynamic_background": "black",
         "loss.mask_margin": 0.0,
         "assume": "masks",
     },

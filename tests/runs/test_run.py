@@ -250,7 +250,7 @@ FIRST = {
     "": "antialias app assume checkpoint_every dap graph keep_checkpoints resident_bytes seed stage2 static_appearance "
     "static_geometry vdp masks model loss optim densify schedule",
     "densify": "every gradient max_gaussians max_size min_opacity split_size visibility",
-    "loss": "depth depth_dynamic depth_end dynamic dynamic_background joint ssim static",
+    "loss": "depth depth_dynamic depth_end dynamic joint ssim static",
     "masks": "dilate erode holes",
     "model": "appearance_degree appearance_opacity depth dynamic_points half max_static_points position_bands "
     "sh_degree skip time_bands width",

@@ -84,7 +84,7 @@ def background_of(config, capture):
 def backgrounds(trainer):
     """What the next step composites behind the joint, the static and the dynamic image."""
     trainer.step(trainer.protocol.at(trainer.iteration), trainer._sample(trainer.protocol.at(trainer.iteration)))
-    return trainer.step._inputs.backgrounds
+    return trainer.step._backgrounds
 
 
 def resumed(run):
@@ -182,8 +182,7 @@ def test_the_psnr_of_training_is_finite_where_nothing_is_wrong(run, tmp_path):
 def mean_run(tmp_path_factory, quickly):
     """A finished run on a small capture without a background of its own, over the mean colour of its frames."""
     folder = tmp_path_factory.mktemp("mean")
-    loss = dataclasses.replace(tiny.CONFIG.loss, dynamic_background="black")
-    return finished(tiny.write(folder), folder / "run", background="mean", loss=loss)
+    return finished(tiny.write(folder), folder / "run", background="mean")
 
 
 def mean_of(capture):

@@ -160,7 +160,7 @@ def terms_of(stage, loss=LOSS, schedule=SCHEDULE):
     with torch.no_grad():
         splats = scene.splats(torch.zeros(1), phase.use_deformation, phase.use_appearance, phase.sh_degree)
         rendering = render(splats, CAMERA, settings=RenderSettings(branches=True, depth=True))
-    step(plan, Sample(0, 0.0, PURPLE, 0))
+    step(plan, Sample(0, 0.0, 0))
     return {name: torch.tensor(value) for name, value in step.take_means().terms.items()}, rendering
 
 
@@ -168,7 +168,7 @@ def changed_by(stage, loss=LOSS, at=0, **options):
     """Names of the parameters that an iteration of a stage changes; layers of networks count as the network."""
     scene, plan, step = prepared(stage, loss, at, **options)
     before = {name: p.detach().clone() for name, p in scene.named_parameters()}
-    step(plan, Sample(0, 0.0, PURPLE, 0))
+    step(plan, Sample(0, 0.0, 0))
     changed = [name for name, p in scene.named_parameters() if not torch.equal(p, before[name])]
     return {name.split(".")[0] if name.startswith(("deformation", "appearance")) else name for name in changed}
 
@@ -201,12 +201,12 @@ def test_the_static_term_is_the_weighted_static_loss_in_every_stage(stage):
 
 
 @pytest.mark.parametrize(("stage", "margin"), [("stage1", 0.0), ("stage2", 0.0), ("stage1", 1.6)])
-def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_the_sampled_background(stage, margin):
+def test_the_dynamic_term_is_the_weighted_dynamic_loss_over_black(stage, margin):
     """It leaves out the margin of the mask, here in pixels."""
     terms, rendering = terms_of(stage, dataclasses.replace(LOSS, mask_margin=margin / max(VIEW_MASK.shape)))
     dynamic = rendering.dynamic
-    image = dynamic.image.double() + (1.0 - dynamic.alpha.double())[..., None] * PURPLE.double()
-    truth = torch.where(VIEW_MASK[..., None], PURPLE.double(), view_truth())
+    image = dynamic.image.double()
+    truth = view_truth() * (~VIEW_MASK)[..., None]
     if margin:
         truth = torch.where(mask_border(VIEW_MASK, 2)[..., None], image, truth)
     assert error(terms["dynamic"], 0.7 * compared(image, truth, 0.3)) < 1e-6
@@ -237,7 +237,7 @@ def test_without_its_gate_the_depth_term_is_equation_14_in_transparent_pixels_to
     assert (transparent & (rendering.static.alpha == 0)).any()
     assert error(terms["depth"], 2.0 * expected_depth(rendering.static, VIEW_MASK, min_alpha=-1.0)) < 1e-5
     scene, plan, step = prepared("pretrain", ungated)
-    step(plan, Sample(0, 0.0, PURPLE, 0))
+    step(plan, Sample(0, 0.0, 0))
     assert all(parameter.isfinite().all() for parameter in scene.parameters())
 
 
@@ -250,7 +250,7 @@ def test_the_means_of_opacities_and_standard_deviations_can_be_terms():
 
 def terms_with_trust(weight, margin, loss=LOSS, **options):
     _, plan, step = prepared("stage1", loss, trust=(weight, margin), **options)
-    step(plan, Sample(0, 0.0, PURPLE, 0))
+    step(plan, Sample(0, 0.0, 0))
     return step.take_means().terms
 
 
@@ -275,7 +275,7 @@ def test_depth_terms_are_multiplied_by_the_trust_in_the_view():
 def test_what_follows_a_mask_that_is_not_trusted_has_no_loss():
     _, plan, step = prepared("stage2")
     step.views.mask_trust.zero_()
-    step(plan, Sample(0, 0.0, PURPLE, 0))
+    step(plan, Sample(0, 0.0, 0))
     terms, trusted = step.take_means().terms, terms_with_trust(1.0, 0.0)
     follow = {"static", "dynamic", "depth", "depth_dynamic"}
     assert all(trusted[name] > 0.0 for name in follow)
@@ -342,7 +342,7 @@ def test_a_term_with_a_weight_of_zero_is_not_reported(weight, off):
 
 
 def test_a_term_that_begins_between_two_reports_is_averaged_over_its_own_iterations():
-    schedule, sample = dataclasses.replace(SCHEDULE, joint_from=0), Sample(0, 0.0, PURPLE, 0)
+    schedule, sample = dataclasses.replace(SCHEDULE, joint_from=0), Sample(0, 0.0, 0)
     _, plan, step = prepared("stage1", schedule=schedule)
     without = dataclasses.replace(plan, phase=dataclasses.replace(plan.phase, with_joint=False))
     step(without, sample)

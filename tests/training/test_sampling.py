@@ -8,7 +8,7 @@ from warpgs.training.sampling import Sampler
 
 @pytest.mark.parametrize("num_views", [1, 20, 160])
 def test_noise_on_time_has_its_deviation_in_frame_intervals(num_views):
-    sampler = Sampler(seed=0, num_views=num_views, black=True)
+    sampler = Sampler(seed=0, num_views=num_views)
     noise = torch.tensor([sampler(iteration, 0, 0.1).time_noise for iteration in range(2_000)])
     assert (noise.std() * num_views).item() == pytest.approx(0.1, rel=0.06)
     assert abs(noise.mean().item()) * num_views < 0.01

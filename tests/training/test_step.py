@@ -29,8 +29,6 @@ def send(inputs, **changes):
     values = {
         "time_noise": 0.5,
         "dropout_seed": 2**24 - 1,
-        "background": [0.7, 0.8, 0.9],
-        "dynamic_background": [0.1, 0.2, 0.3],
         "scales": {"psnr": -10.0, "static": 2.0},
         "learning_rates": {"networks": 4.0, "means": 3.0},
     }
@@ -42,7 +40,6 @@ def test_inputs_reach_the_tensors_of_their_names():
     send(inputs)
     assert inputs.time_noise.tolist() == [0.5]
     assert inputs.dropout_seed.tolist() == [2**24 - 1]
-    assert torch.equal(inputs.backgrounds, torch.tensor([[0.7, 0.8, 0.9], [0.7, 0.8, 0.9], [0.1, 0.2, 0.3]]))
     assert {name: value.item() for name, value in inputs.scale.items()} == {"static": 2.0, "psnr": -10.0}
     assert inputs.scales.tolist() == [2.0, -10.0]
     assert {name: value.item() for name, value in inputs.learning_rates.items()} == {"means": 3.0, "networks": 4.0}
@@ -50,7 +47,7 @@ def test_inputs_reach_the_tensors_of_their_names():
 
 def test_inputs_stay_at_their_addresses():
     inputs = make_inputs()
-    tensors = [inputs.time_noise, inputs.backgrounds, inputs.scales, *inputs.scale.values()]
+    tensors = [inputs.time_noise, inputs.scales, *inputs.scale.values()]
     addresses = [tensor.data_ptr() for tensor in tensors]
     send(inputs, time_noise=0.75)
     assert inputs.time_noise is tensors[0]
@@ -160,7 +157,7 @@ def test_gaussians_are_omitted_at_random_once_both_branches_are_trained(data, tm
 
 
 def test_each_iteration_and_each_rank_omits_other_gaussians(monkeypatch):
-    sampler, seeds = Sampler(0, 6, black=False), []
+    sampler, seeds = Sampler(0, 6), []
     for rank in range(2):
         monkeypatch.setattr(ranks, "rank", lambda rank=rank: rank)
         seeds += [sampler(k, 0, 0.0).dropout_seed for k in range(10)]

@@ -27,8 +27,6 @@ class LossConfig:
     hidden_appearance: bool = False
     """Whether the joint image also trains how static Gaussians change over time while something dynamic hides them, as
     in the paper. No object is quite opaque, so that what it hides takes its colour."""
-    dynamic_background: Literal["black", "random"] = "black"
-    """Background of the dynamic image unless ``background`` is white: black (paper), or random, hiding no Gaussian."""
     depth: float = 0.5
     """Initial λ_depth, the weight of the static image's depth in the static region (Eq. 14) [view sizes; scene units
     if ``densify.unit`` is extent (paper)]."""

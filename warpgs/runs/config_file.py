@@ -22,7 +22,7 @@ MAX_BYTES = 1 << 20
 REMOVED_PRESETS = ("fast",)
 REMOVED = {
     "densify": ("depth_gradients",),
-    "loss": ("mask_tolerance",),
+    "loss": ("dynamic_background", "mask_tolerance"),
     "schedule": ("half_size_until", "mask_trial"),
 }
 

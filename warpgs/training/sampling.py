@@ -13,15 +13,13 @@ from .step import Sample
 
 
 class Sampler:
-    """Chooses a view, noise on time, a background and what to omit for every iteration of this rank.
+    """Chooses a view, noise on time and what to omit for every iteration of this rank.
 
     Every epoch visits each view once, in a new order; the ranks take its views in turn.
-
-    The background is random unless ``black``.
     """
 
-    def __init__(self, seed: int, num_views: int, black: bool) -> None:
-        self._seed, self._num_views, self._black = seed, num_views, black
+    def __init__(self, seed: int, num_views: int) -> None:
+        self._seed, self._num_views = seed, num_views
         self._orders: dict[tuple[int, int], list[int]] = {}
 
     def __call__(self, iteration: int, rollbacks: int, noise_deviation: float) -> Sample:
@@ -29,10 +27,9 @@ class Sampler:
         generator = random_numbers(self._seed, "draw", iteration, rollbacks)
         for _ in range(ranks.rank() + 1):  # each rank has numbers of its own, after those of the ranks before it
             noise = noise_deviation / self._num_views * torch.randn(1, dtype=torch.float32, generator=generator).item()
-            background = torch.rand(3, dtype=torch.float32, generator=generator)
             dropout_seed = int(torch.randint(MAX_SEED, (1,), generator=generator))
         view = next(self.views(iteration, rollbacks))
-        return Sample(view, noise, torch.zeros(3, dtype=torch.float32) if self._black else background, dropout_seed)
+        return Sample(view, noise, dropout_seed)
 
     def views(self, iteration: int, rollbacks: int) -> Iterator[int]:
         """The views of this rank from an iteration on, without end."""

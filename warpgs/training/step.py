@@ -43,13 +43,11 @@ class Sample(NamedTuple):
     Attributes:
         view: Index of the training view.
         time_noise: Added to the time that the deformation network sees.
-        background: [3] colour behind the dynamic image, unless the capture's is white.
         dropout_seed: Chooses the Gaussians that are omitted, an integer below ``ops.dropout.MAX_SEED``.
     """
 
     view: int
     time_noise: float
-    background: Float[Tensor, "3"]
     dropout_seed: int
 
 
@@ -103,6 +101,10 @@ class Step:
         self.alignments, self._depth_trust = alignments, depth_trust
         sums = (*TERMS, "psnr", STEPS)
         self._inputs = StepInputs(sums, optim.GROUPS, device)
+        background = background_color(views.background)
+        # Behind the dynamic image is black, as in the paper, but in captures over white, whose alpha is exact.
+        colors = [background, background, background if views.background == "white" else (0.0, 0.0, 0.0)]
+        self._backgrounds = torch.tensor(colors, dtype=torch.float32, device=device)
         self._sums = torch.zeros(len(sums), dtype=torch.float32, device=device)
         self._counts: Counter[str] = Counter()  # iterations with each term since the last check, and of all
         self._zero, self._one = (
@@ -130,12 +132,9 @@ class Step:
         """Runs one iteration."""
         weights = {name: term.weight(plan, self.config.loss) for name, term in TERMS.items()}
         self._counts.update([STEPS, *(name for name in self._active(plan.phase) if weights[name])])
-        background = background_color(self.views.background)
         self._inputs.send(
             time_noise=sample.time_noise,
             dropout_seed=sample.dropout_seed,
-            background=background,
-            dynamic_background=background if self.views.background == "white" else sample.background.tolist(),
             scales={**weights, "psnr": DECIBELS, STEPS: 1.0},
             learning_rates=optim.learning_rates(self.config.optim, self.unit, plan),
         )
@@ -174,7 +173,7 @@ class Step:
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
-        backgrounds, offsets = self._inputs.backgrounds, self.density.screen_offsets if phase.densifies else None
+        backgrounds, offsets = self._backgrounds, self.density.screen_offsets if phase.densifies else None
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss

@@ -73,7 +73,7 @@ class Trainer:
         self.protocol = Protocol(
             start.plan, start.has_depth, start.num_aligned > 0, start.fits_motion, start.plan.branches_in_stage2
         )
-        self._sampler = Sampler(self.config.seed, len(self.views), self.config.loss.dynamic_background == "black")
+        self._sampler = Sampler(self.config.seed, len(self.views))
         self._start_from(start.scene)
 
     def _start_from(self, scene: SplitScene) -> None:
@@ -197,7 +197,7 @@ class Trainer:
         return random_numbers(self.config.seed, purpose, self.iteration, self.rollbacks, device)
 
     def _sample(self, plan: IterationPlan) -> Sample:
-        """This rank's view, noise on time and background in the current iteration."""
+        """This rank's view, noise on time and seed of the dropout in the current iteration."""
         return self._sampler(self.iteration, self.rollbacks, plan.time_noise)
 
     # Checks and checkpoints -------------------------------------------------------------------------------------------
