@@ -88,7 +88,8 @@ def extract_and_match(job: Job, report: Report) -> None:
     if finished.exists() and has_features(job.database, job.files):
         return
     finished.unlink(missing_ok=True)
-    job.database.unlink(missing_ok=True)
+    for end in ("", "-wal", "-shm"):  # a new database cannot be made next to the log of another one
+        Path(f"{job.database}{end}").unlink(missing_ok=True)
     reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reading.camera_model = job.lens
     if (params := _starting_parameters(job)) is not None:
