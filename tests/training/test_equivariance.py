@@ -23,6 +23,7 @@ decides what is near a threshold: Adam makes large steps of tiny gradients."""
 SMALL = dataclasses.replace(
     BEST,
     device="cpu",
+    seed=1,
     background="black",
     model=dataclasses.replace(
         BEST.model,
@@ -37,11 +38,12 @@ SMALL = dataclasses.replace(
         max_static_points=50,
         dynamic_points=20,
     ),
-    densify=dataclasses.replace(BEST.densify, every=4, gradient=4e-3, noise=2e7, min_pixels=0, max_gaussians=500),
+    densify=dataclasses.replace(BEST.densify, every=4, gradient=3e-3, noise=2e7, min_pixels=0, max_gaussians=500),
     schedule=dataclasses.replace(tiny.SCHEDULE, warmup=4, settle=6),
     checkpoint_every=1000,
 )
-"""The preset best with few Gaussians, small networks and a short schedule."""
+"""The preset best with few Gaussians, small networks and a short schedule. With this seed and threshold, no gradient of
+3dgs and absgrad is closer than 3 % to the threshold, and no size closer than 1 %, so that rounding decides nothing."""
 
 
 def moved(capture, scale, shift):
