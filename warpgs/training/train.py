@@ -297,6 +297,7 @@ def _read_evaluation_frames(capture: Capture, config: TrainConfig, quiet: bool) 
     """Raises ValueError if the evaluation will fail to read a file: when training is done, it is too late."""
     if ranks.is_first():  # which evaluates
         check_views(capture, config.as_taken, quiet)
+    ranks.any_rank(False)  # a lost rank is found here: the others would prepare a start for nothing
 
 
 def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
