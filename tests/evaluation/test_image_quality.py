@@ -42,7 +42,7 @@ def test_psnr_averages_squares_over_pixels_and_channels_before_the_logarithm(pai
     )
 
 
-def test_psnr_is_at_most_that_of_rounding_the_truth_to_8_bits(pair):
+def test_rounding_the_truth_to_8_bits_limits_psnr(pair):
     levels = (torch.arange(10_000) / 9_999).double()
     rounding = (levels - (255.0 * levels).round() / 255.0).square().mean()
     limit = -10.0 * math.log10(rounding)

@@ -224,9 +224,8 @@ def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitSta
     config, trial = with_trusted_masks(config, capture, log, quiet)
     trainer = Trainer(prepare_start(config, capture), Path(ranks.text_of_first(folder)))
     if ranks.is_first():
-        run = Run.create(
-            trainer.run, trainer.config
-        )  # last: the folder of a run that is refused before is removed again
+        # Last: the folder of a run that is refused before is removed again.
+        run = Run.create(trainer.run, trainer.config)
         write_start(run.folder, asked, trainer.notes)
         if trial:
             write_json(trainer.run / MASK_TRIAL, trial)
