@@ -34,6 +34,10 @@ REPORTED = "warpgs/reported"
 """Key of the ranks' common store: how many of them have ended with an error."""
 
 
+CODE = "warpgs/code"
+"""Key of the exit code of the first of them, which all end with."""
+
+
 class RankLostError(ValueError):
     """Another rank ended, or did not answer for ``TIMEOUT_MINUTES``."""
 
@@ -80,7 +84,12 @@ def _end(error: BaseException) -> None:
     code = INTERRUPTED if isinstance(error, KeyboardInterrupt) else FAILED
     is_first = True
     with contextlib.suppress(RuntimeError):  # rank 0 may have held the store, if it was not torchrun
-        is_first = dist.distributed_c10d._get_default_store().add(REPORTED, 1) == 1
+        store = dist.distributed_c10d._get_default_store()
+        is_first = store.add(REPORTED, 1) == 1
+        if is_first:
+            store.set(CODE, str(code))
+        else:  # torchrun stops the others, which does not make theirs an interruption
+            code = int(store.get(CODE))
     if isinstance(error, RankLostError) and torch.cuda.is_initialized():
         # The GPU still waits for the lost rank; an orderly exit would wait for the GPU.
         if is_first:
