@@ -8,7 +8,7 @@ import numpy as np
 
 from warpgs.export.baking import PARTS, Baked, Branch
 from warpgs.export.packing import from_planes
-from warpgs.export.text import from_text
+from warpgs.export.page import REPLACED
 from warpgs.export.transform import Levels
 
 
@@ -37,3 +37,14 @@ def levels(blocks, name, part, metadata, octaves):
 
 def integers(block, shape):
     return from_planes(np.frombuffer(gzip.decompress(from_text(block)), np.uint8), shape)
+
+
+def from_text(text):
+    """Decodes the bytes that ``to_text`` encoded, as the player does."""
+    values = []
+    for code in map(ord, text):
+        if 128 <= code < 512:
+            values.append(ord(REPLACED[code // 128 - 1]))
+        values.append(code % 128)
+    bits = np.unpackbits(np.array(values, np.uint8)[:, None], axis=1)[:, 1:].reshape(-1)
+    return np.packbits(bits[: len(bits) // 8 * 8]).tobytes()

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from tests.export import node
+from tests.export.pages import from_text
 from warpgs.export import page
-from warpgs.export.text import REPLACED, from_text, to_text
+from warpgs.export.page import REPLACED, to_text
 
 RANDOM = np.random.default_rng(0)
 SAMPLES = [

@@ -8,10 +8,9 @@ from tests.reference.encoding import encode
 from tests.reference.mlp import perceptron
 from tests.scenes import error, generator, random_like, relative_error
 from warpgs.config.presets import PRESETS
-from warpgs.model.appearance import AppearanceField
 from warpgs.model.fields import FIELDS, make_deformation
 from warpgs.model.mlp_deformation import MlpDeformation
-from warpgs.model.scene import SplitScene
+from warpgs.model.scene import AppearanceField, SplitScene
 from warpgs.model.trunk import Trunk
 
 CENTER = torch.tensor([1.0, -2.0, 0.5])

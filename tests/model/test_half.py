@@ -12,7 +12,7 @@ from tests.reference.sh import bases
 from tests.scenes import generator, relative_error
 from warpgs.config.presets import PRESETS
 from warpgs.model import trunk
-from warpgs.model.appearance import AppearanceField
+from warpgs.model.scene import AppearanceField
 from warpgs.ops import mlp
 
 NUM, RESIDUAL = 1000, 0.1

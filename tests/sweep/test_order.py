@@ -3,9 +3,8 @@
 import pytest
 
 from warpgs.runs import checkpoint
-from warpgs.sweep.board import Board
+from warpgs.sweep.board import Board, longest_first, remaining_cost
 from warpgs.sweep.cells import plan_cells
-from warpgs.sweep.order import longest_first, remaining_cost
 from warpgs.sweep.spec import SweepSpec, Variant, read_spec
 
 LONGEST_FIRST = ["c", "d", "e", "no-dap", "a", "b", "no-s2", "no-app"]

@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
 from warpgs.data.capture import Capture, Frame, TakenFrame
 from warpgs.files import write_text
-from warpgs.rendering import Rendering
+from warpgs.rendering import Layer, Rendering
 
-from .distort import distort
 from .lpips import Lpips
 from .metric import Comparison, Renderer, known
 from .metrics import METRICS
@@ -146,7 +147,29 @@ def check_views(capture: Capture, as_taken: bool = False, quiet: bool = True) ->
 def _as_taken(scene: Renderer, taken: TakenFrame, camera: Camera) -> tuple[Frame, Rendering]:
     """A frame as it was taken, and the scene from the pose of a camera as the frame's lens shows it."""
     wide = replace(taken.frame.camera.to(scene.device), viewmat=camera.viewmat)
-    return taken.frame, distort(scene.render(wide, branches=True), taken.positions)
+    return taken.frame, _distorted(scene.render(wide, branches=True), taken.positions)
+
+
+def _distorted(rendering: Rendering, positions: Float[Tensor, "H W 2"]) -> Rendering:
+    """The layers of a rendering at other positions: images with bicubic interpolation, without depth.
+
+    Args:
+        rendering: Through the wide camera of a ``TakenFrame``.
+        positions: [H, W, 2] its positions, on any device.
+    """
+    height, width = rendering.joint.alpha.shape
+    size = torch.tensor([width, height], dtype=torch.float32, device=rendering.joint.alpha.device)
+    grid = 2.0 * positions.to(size.device) / size - 1.0
+    static, dynamic = (
+        None if layer is None else _sampled(layer, grid) for layer in (rendering.static, rendering.dynamic)
+    )
+    return rendering._replace(joint=_sampled(rendering.joint, grid), static=static, dynamic=dynamic)
+
+
+def _sampled(layer: Layer, grid: Float[Tensor, "H W 2"]) -> Layer:
+    values = torch.cat([layer.image, layer.alpha[..., None]], 2).permute(2, 0, 1)[None]
+    sampled = grid_sample(values, grid[None], mode="bicubic", padding_mode="border", align_corners=False)[0]
+    return Layer(sampled[:-1].permute(1, 2, 0).contiguous(), sampled[-1].clamp(0, 1), None)
 
 
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:

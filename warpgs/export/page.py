@@ -2,8 +2,8 @@
 
 The player is in ``player/``: the page, its style sheet, two shaders, and two scripts, one of which sorts in a worker.
 The data are in the page as elements ``<script type="application/gzip">`` next to a JSON object with their shapes and
-steps, as text of seven bits per character (``text``); browsers do not run scripts of this type. The player restores the
-values and packs them for the GPU.
+steps, as text of seven bits per character (``to_text``); browsers do not run scripts of this type. The player restores
+the values and packs them for the GPU.
 """
 
 import html
@@ -29,7 +29,6 @@ from .job import Job, Writer
 from .moving import KEYS, SECONDS
 from .packing import to_planes
 from .start_camera import StartView, sample_cameras, start_view
-from .text import to_text
 from .transform import Levels
 
 VERSION = 3
@@ -47,6 +46,9 @@ DIFFERENCES = "means"
 
 PLACEHOLDER = re.compile(r"\[\[([a-z.]+)\]\]")
 """Marks where the player's page includes another of its files, the title or the scene."""
+
+REPLACED = "\0\r<"
+"""Characters that a page cannot hold as they are: browsers replace NUL, CR becomes LF, and < could end the element."""
 
 
 def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True) -> int:
@@ -127,6 +129,23 @@ def _packed(name: str, integers: Int32[np.ndarray, "K N C"]) -> str:
     compressor = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS, strategy=zlib.Z_RLE)
     packed = compressor.compress(to_planes(integers).tobytes()) + compressor.flush()
     return _block("application/gzip", name, to_text(packed))
+
+
+def to_text(data: bytes) -> str:
+    """Bytes as text in a ``<script>`` element of a UTF-8 page: 8 / 7 of their size, where base64 takes 4 / 3.
+
+    A character holds seven bits. One of ``REPLACED`` and the character after it become one character between 128 and
+    511, which takes two bytes in UTF-8, as they would; a last one becomes 512 plus itself.
+    """
+    bits = np.unpackbits(np.frombuffer(data, np.uint8))
+    groups = np.pad(bits, (0, -len(bits) % 7)).reshape(-1, 7)
+    characters = (np.packbits(groups, axis=1) >> 1).tobytes().decode("ascii")
+    return re.sub(f"([{REPLACED}])(.?)", _replacement, characters, flags=re.DOTALL)
+
+
+def _replacement(match: re.Match[str]) -> str:
+    first, second = match[1], match[2]
+    return chr(128 * (1 + REPLACED.index(first)) + ord(second)) if second else chr(512 + ord(first))
 
 
 def _differences(levels: Int32[np.ndarray, "K N C"]) -> Int32[np.ndarray, "K N C"]:

@@ -4,8 +4,9 @@ import csv
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,13 @@ from rich.live import Live
 from rich.table import Column, Table
 from rich.text import Text
 
+from warpgs.config import scaled
 from warpgs.files import read_bounded
+from warpgs.runs.checkpoint import list_checkpoints
 from warpgs.training.logger import LINE
+from warpgs.training.schedule import Protocol
 
 from .cells import Cell, arguments, evaluation_arguments, finished_metrics, is_evaluated
-from .order import longest_first
 from .scheduler import Event
 from .worker import STARTED, Job, last_lines
 
@@ -205,3 +208,19 @@ class Board:
         if self._live is not None:
             self._live.stop()
             self._live = None
+
+
+def remaining_cost(cell: Cell) -> int:
+    """About how long the training of a cell still takes, relative to other cells of its capture."""
+    protocol = Protocol(scaled(cell.config), has_depth=cell.config.depth)
+    done = max((int(path.stem) for path in list_checkpoints(cell.folder) if path.stem.isdecimal()), default=0)
+    return protocol.remaining_cost(done)
+
+
+def longest_first(cells: Iterable[Cell]) -> list[Cell]:
+    """The cells of each seed and capture by remaining cost: a long one that starts last would run beside idle GPUs.
+
+    Seeds and captures keep their order, so that whole tables come first, and so do cells of equal cost.
+    """
+    tables = groupby(cells, key=lambda cell: (cell.seed, cell.scene))
+    return [cell for _, table in tables for cell in sorted(table, key=remaining_cost, reverse=True)]
