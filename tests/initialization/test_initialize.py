@@ -18,7 +18,7 @@ from warpgs.initialization.point_cloud import (
     subsample,
     unproject,
 )
-from warpgs.model.fields import make_deformation
+from warpgs.model.fields import FIELDS, make_deformation
 from warpgs.training.logger import TrainingLogger
 from warpgs.training.schedule import Protocol
 from warpgs.views.views import Views
@@ -74,12 +74,16 @@ def views_of(capture):
     return Views(capture, torch.device("cpu"), 1 << 30)
 
 
-def dynamic_gaussians(capture, alignments, config=CONFIG, deformation=None, fits=None):
-    """The dynamic Gaussians of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
-    views = views_of(capture)
-    fits = initialize.fits_motion(config, capture, views, alignments) if fits is None else fits
-    config, deformation = Protocol(config, True, fits_motion=fits).config, deformation or torch.nn.Identity()
+def dynamic_start(capture, alignments, config=CONFIG, deformation=None, fits=None):
+    """The dynamic start of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
+    views, deformation = views_of(capture), deformation or torch.nn.Identity()
+    fits = initialize.fits_motion(config, capture, views, alignments, deformation) if fits is None else fits
+    config = Protocol(config, True, fits_motion=fits).config
     return initialize.dynamic_gaussians(config, capture, views, alignments, deformation, generator())
+
+
+def dynamic_gaussians(*arguments):
+    return dynamic_start(*arguments).gaussians
 
 
 def constant_depth():
@@ -502,6 +506,12 @@ def test_the_deformation_is_not_fitted_to_dynamic_pixels_of_unknown_depth():
     assert is_new(deformation)
 
 
+def test_a_start_lacks_a_fit_if_the_protocol_asks_for_one_and_the_depth_of_what_moves_is_unknown():
+    for depth, fits, lacks in ((None, True, True), (None, False, False), (constant_depth(), True, False)):
+        capture = make_capture(random_points(50), inverse_depth=depth)
+        assert dynamic_start(capture, RECEDING, FITTED, new_deformation(), fits).lacks_fit == lacks
+
+
 def test_the_deformation_is_fitted_only_if_the_protocol_says_so():
     """The protocol decides before depth is realigned, and then uses the deformation from the start of stage I."""
     capture = make_capture(random_points(9), inverse_depth=constant_depth())
@@ -519,7 +529,8 @@ def test_the_deformation_is_fitted_where_masks_and_depth_show_what_moves(assume,
     capture = make_capture(random_points(50), inverse_depth=constant_depth() if depth else None).assuming(assume)
     config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=steps))
     views = views_of(capture)
-    assert initialize.fits_motion(config, capture, views, ALIGNMENT) == fits
+    assert initialize.fits_motion(config, capture, views, ALIGNMENT, new_deformation()) == fits
+    assert not initialize.fits_motion(config, capture, views, ALIGNMENT, torch.nn.Identity())
 
 
 @pytest.mark.parametrize("steps", [0, 2])
@@ -538,6 +549,25 @@ def test_a_fit_of_the_deformation_that_is_not_used_is_told(data, tmp_path, monke
     logger = Mock(spec=TrainingLogger)
     assert trainer._add_dynamic_gaussians(logger=logger)
     assert logger.log.call_args.args[0].startswith("warning: no deformation follows what moves")
+    assert len(trainer.scene.dynamic)
+
+
+class Still(torch.nn.Module):
+    """A deformation without parameters."""
+
+    def __init__(self, config, center, half_size):
+        super().__init__()
+
+    def forward(self, means, time):
+        return means.new_zeros(len(means), 10)
+
+
+def test_nothing_is_told_of_a_fit_of_a_deformation_without_parameters(data, tmp_path, monkeypatch):
+    monkeypatch.setitem(FIELDS, "still", Still)
+    config = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, deformation="still"))
+    trainer, logger = tiny.trainer(data, tmp_path / "run", config), Mock(spec=TrainingLogger)
+    assert trainer._add_dynamic_gaussians(logger=logger)
+    assert logger.log.call_args_list == []
     assert len(trainer.scene.dynamic)
 
 

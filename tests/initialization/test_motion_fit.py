@@ -217,10 +217,6 @@ def test_the_points_of_each_frame_are_subsampled(monkeypatch):
     assert len(canonical.views) > 10 * NUM_VIEWS
 
 
-def test_a_deformation_without_parameters_stays_as_it_is():
-    assert fit(FOUND, torch.nn.Identity()) is FOUND
-
-
 def test_a_fit_that_is_stopped_leaves_the_deformation_as_it_was():
     deformation, steps = new_deformation(), []
     assert fit(FOUND, deformation, is_stopped=lambda: steps.append(0) or len(steps) == 7) is None

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -16,7 +17,7 @@ from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.views.views import Views
 
-from .dynamic_points import MAX_SCALE, gaussians_in_box, is_depth_known, unproject_pixels
+from .dynamic_points import MAX_SCALE, DynamicPoints, gaussians_in_box, is_depth_known, unproject_pixels
 from .motion_fit import MAX_POINTS, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
 from .tracked_start import start_from_tracks
@@ -78,9 +79,24 @@ def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Gene
     return points, color_points(points, views)
 
 
-def fits_motion(config: TrainConfig, capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> bool:
-    """Whether the deformation is fitted to points before stage I: where masks and depth show what moves."""
-    return config.schedule.fit_motion > 0 and capture.assumption == "masks" and is_depth_known(views, alignments)
+def fits_motion(
+    config: TrainConfig, capture: Capture, views: Views, alignments: Float[Tensor, "T 2"], deformation: nn.Module
+) -> bool:
+    """Whether a deformation with parameters is fitted before stage I: where masks and depth show what moves."""
+    is_asked = config.schedule.fit_motion > 0 and bool(list(deformation.parameters()))
+    return is_asked and capture.assumption == "masks" and is_depth_known(views, alignments)
+
+
+class DynamicStart(NamedTuple):
+    """The dynamic Gaussians that stage I starts from.
+
+    Attributes:
+        gaussians: The Gaussians.
+        lacks_fit: Whether the deformation was to be fitted to what moves, but does not follow it.
+    """
+
+    gaussians: Gaussians
+    lacks_fit: bool = False
 
 
 @torch.no_grad()
@@ -92,7 +108,7 @@ def dynamic_gaussians(
     deformation: nn.Module,
     generator: torch.Generator,
     is_stopped: Callable[[], bool] = bool,
-) -> Gaussians | None:
+) -> DynamicStart | None:
     """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation may be fitted first.
 
     Without depth they start in front of the points around them, or, as ``model.dynamic_start`` says and without visible
@@ -101,21 +117,30 @@ def dynamic_gaussians(
     deformation is fitted unless ``schedule.fit_motion`` is 0, as a protocol's config has it where ``fits_motion`` is
     false. The result is None, and the deformation as it was, if ``is_stopped`` says during the fit that it is to stop.
     """
-    max_count, degree = config.model.dynamic_points, config.model.sh_degree
     if isinstance(deformation, SplineDeformation):
-        return start_from_tracks(find_tracks(capture), deformation, config, capture.view_size, generator)
+        tracks = find_tracks(capture)
+        return DynamicStart(start_from_tracks(tracks, deformation, config, capture.view_size, generator))
     if capture.assumption == "dynamic" and len(capture.points):
-        return _gaussians_at_points(config, capture, generator)
-    count = max(max_count, MAX_POINTS) if config.schedule.fit_motion else max_count
+        return DynamicStart(_gaussians_at_points(config, capture, generator))
+    count = max(config.model.dynamic_points, MAX_POINTS * (config.schedule.fit_motion > 0))
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:
-        return Gaussians.empty(0, degree)
+        return DynamicStart(Gaussians.empty(0, config.model.sh_degree))
+    start: DynamicPoints | None = found
     if config.schedule.fit_motion and found.depth_known:
         times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
-        fitted = fit_motion(deformation, found, times, capture.view_size, config, generator, is_stopped)
-        if fitted is None:
-            return None
-        found = fitted
+        start = fit_motion(deformation, found, times, capture.view_size, config, generator, is_stopped)
+    if start is None:
+        return None
+    lacks_fit = config.schedule.fit_motion > 0 and start is found
+    return DynamicStart(_gaussians_at_dynamic_points(config, capture, start, generator), lacks_fit)
+
+
+def _gaussians_at_dynamic_points(
+    config: TrainConfig, capture: Capture, found: DynamicPoints, generator: torch.Generator
+) -> Gaussians:
+    """Gaussians at a random subset of points; in the scene's box if ``model.dynamic_start`` says so or none is left."""
+    max_count = config.model.dynamic_points
     found = found.chosen(subsample(found.positions, max_count, generator))
     is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
     if is_uniform or len(found.positions) == 0:

@@ -71,7 +71,7 @@ def fit_motion(
     The points around one time are canonical. Deformed to the time of each other frame, they come close to its points.
 
     Args:
-        deformation: As ``fields.FIELDS`` says; its parameters are changed. One without parameters stays as it is.
+        deformation: As ``fields.FIELDS`` says; its parameters, of which there must be some, are changed.
         found: At least one point, all at known depth.
         times: [T] times of the views in [0, 1].
         view_size: Of the capture [scene units].
@@ -86,9 +86,7 @@ def fit_motion(
     """
     # In half precision, the network of one of six seeds learned nothing on builtin:studio without depth.
     fitted = in_single_precision(copy.deepcopy(deformation).requires_grad_(True))
-    device = next((parameter.device for parameter in fitted.parameters()), None)
-    if device is None:
-        return found
+    device = next(fitted.parameters()).device
     points = _PointsByView(found, times, view_size, device, generator)
     if not _fit(fitted, points, config, generator, is_stopped):
         return None

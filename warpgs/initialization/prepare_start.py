@@ -170,6 +170,10 @@ def _do_without_depth(start: Start) -> Start:
     return start.noted(f"the capture has no depth{made}{reason}")
 
 
+def _motion_can_be_fitted(start: Start) -> bool:
+    return fits_motion(start.plan, start.capture, start.views, start.alignments, start.scene.deformation)
+
+
 def _fit_motion(start: Start) -> Start:
     """Has the deformation fitted to points before stage I, when depth is aligned to the rendering."""
     return replace(start, fits_motion=True)
@@ -182,6 +186,6 @@ REMEDIES: dict[str, Remedy] = {
     "alignment of depth": Remedy(lambda start: True, _align_depth),
     "depth by size": Remedy(lambda start: start.plan.loss.object_depth, _measure_objects),
     "lack of depth": Remedy(_lacks_depth, _do_without_depth),
-    "motion fit": Remedy(lambda s: fits_motion(s.plan, s.capture, s.views, s.alignments), _fit_motion),
+    "motion fit": Remedy(_motion_can_be_fitted, _fit_motion),
 }
 """Remedies by name, in the order in which they are applied before training."""

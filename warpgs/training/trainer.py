@@ -177,16 +177,14 @@ class Trainer:
             logger.log(f"before stage I, {steps:,} steps fit the deformation to points on what moves")
         ranks.any_rank(False)  # finds a lost rank
         sources = (self.protocol.config, self.capture, self.views, self.alignments, self.scene.deformation)
-        before = [parameter.clone() for parameter in self.scene.deformation.parameters()]
         found = initialize.dynamic_gaussians(
             *sources, self._generator("dynamic"), lambda: interrupt is not None and interrupt.requested
         )
         if ranks.any_rank(found is None) or found is None:
             return False
-        same = all(map(torch.equal, before, self.scene.deformation.parameters()))
-        if logger is not None and self.protocol.fits_motion and same:
+        if logger is not None and found.lacks_fit:
             logger.log("warning: no deformation follows what moves: dynamic Gaussians start where frames show them")
-        self.scene.dynamic = found
+        self.scene.dynamic = found.gaussians
         self._start_from(self.scene)
         return True
 
