@@ -18,6 +18,7 @@ from warpgs.initialization.initialize import initial_scene
 from warpgs.initialization.point_cloud import random_points
 from warpgs.initialization.prepare_start import prepare_start
 from warpgs.training.trainer import Trainer
+from warpgs.views.views import Views
 
 FOLDERS = ("depth", "depths", "disp")
 """Where the layouts have depth; MegaSaM has one file for all."""
@@ -90,7 +91,9 @@ def test_the_scene_is_three_times_as_wide_as_its_cameras_box(layout, capture):
 
 @UNPROJECTED
 def test_static_gaussians_start_at_random_positions(layout, capture):
-    scene = initial_scene(tiny.CONFIG, opened(capture), torch.Generator().manual_seed(0))
+    captured = opened(capture).assuming("static")
+    views = Views(captured, torch.device("cpu"), tiny.CONFIG.resident_bytes)
+    scene = initial_scene(tiny.CONFIG, captured, views, torch.Generator().manual_seed(0))
     expected = random_points(torch.zeros(0, 3), tiny.MODEL.max_static_points, torch.Generator().manual_seed(0))
     assert torch.equal(scene.static.means, expected)
 

@@ -120,7 +120,7 @@ def test_views_that_are_fitted_together_have_alignments_of_their_own(monkeypatch
         if source == "points":
             found, unknown = alignment.align_to_points(capture, views).alignments, torch.nan
         else:
-            scene = initialize.initial_scene(CONFIG, capture, generator())
+            scene = initialize.initial_scene(CONFIG, capture, views, generator())
             found, unknown = alignment.align_to_rendering(before, views, scene, 0), 7.0
         expected = torch.tensor([[1.0, 0.0], [unknown, unknown], [0.25, 0.0]])
         assert torch.allclose(found, expected, atol=2e-3, equal_nan=True)  # depth is stored in half precision

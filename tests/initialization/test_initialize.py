@@ -74,6 +74,10 @@ def views_of(capture):
     return Views(capture, torch.device("cpu"), 1 << 30)
 
 
+def initial_scene(config, capture):
+    return initialize.initial_scene(config, capture, views_of(capture), generator())
+
+
 def dynamic_start(capture, alignments, config=CONFIG, deformation=None, fits=None):
     """The dynamic start of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
     views, deformation = views_of(capture), deformation or torch.nn.Identity()
@@ -159,7 +163,7 @@ def test_sizes_without_bounds_have_no_resolution():
 def test_static_gaussians_of_a_cloud_of_several_scans_are_visible():
     points = points_at([9, 12, 14, 20, 25, 30], [9, 20, 30, 7, 40, 25])
     capture = make_capture(points.repeat(20, 1) + 1e-4 * torch.randn(120, 3, generator=generator()))
-    static = initialize.initial_scene(CONFIG, capture, generator()).static
+    static = initial_scene(CONFIG, capture).static
     assert static.scales.min() > 0.25 * DEPTH / 46.0
 
 
@@ -170,7 +174,7 @@ def test_what_cameras_resolve_is_a_quarter_of_the_mean_side_of_a_pixel(monkeypat
     capture = capture.with_cameras({n: dataclasses.replace(c, K=c.K * sides) for n, c in capture.cameras.items()})
     start = Mock(wraps=gaussians_at)
     monkeypatch.setattr(initialize, "gaussians_at", start)
-    initialize.initial_scene(CONFIG, capture, generator())
+    initial_scene(CONFIG, capture)
     focal_x, focal_y, _ = capture.cameras["0"].K.diagonal().tolist()
     assert start.call_args.kwargs["resolution"] == pytest.approx(
         0.25 * capture.median_depth / (0.5 * (focal_x + focal_y)), rel=1e-5
@@ -229,7 +233,7 @@ def test_few_points_are_enough(num):
 
 def test_initial_static_gaussians_have_the_colours_of_the_points():
     points, colors = random_points(9), torch.randint(0, 256, (9, 3), generator=generator(), dtype=torch.uint8)
-    static = initialize.initial_scene(CONFIG, make_capture(points, colors), generator()).static
+    static = initial_scene(CONFIG, make_capture(points, colors)).static
     assert torch.equal(static.means, points)
     assert error(0.5 + 0.28209479 * static.sh_dc[:, 0].double(), colors.double() / 255.0) < 1e-6
 
@@ -241,7 +245,7 @@ def test_initial_colours_can_be_those_of_deformable_3dgs(assumption, has_colors)
     points = random_points(9)
     colors = torch.randint(0, 256, (9, 3), generator=generator(), dtype=torch.uint8) if has_colors else None
     capture = make_capture(points, colors).assuming(assumption)
-    static = initialize.initial_scene(GREY, capture, generator()).static
+    static = initial_scene(GREY, capture).static
     gaussians = dynamic_gaussians(capture, ALIGNMENT, GREY) if assumption == "dynamic" else static
     assert torch.equal(gaussians.means, points)
     assert gaussians.sh_dc.min() >= -1e-7
@@ -251,21 +255,21 @@ def test_initial_colours_can_be_those_of_deformable_3dgs(assumption, has_colors)
 
 def test_many_points_are_subsampled_at_random():
     points = random_points(500)
-    static = initialize.initial_scene(CONFIG, make_capture(points), generator()).static
+    static = initial_scene(CONFIG, make_capture(points)).static
     assert len(static) == NETWORK.max_static_points
     assert (static.means[:, None] == points).all(2).any(1).all()
     assert len(static.means.unique(dim=0)) == NETWORK.max_static_points
 
 
 def test_without_points_static_gaussians_start_at_random_in_the_unit_box():
-    static = initialize.initial_scene(CONFIG, make_capture(torch.zeros(0, 3)), generator()).static
+    static = initial_scene(CONFIG, make_capture(torch.zeros(0, 3))).static
     assert len(static) == NETWORK.max_static_points
     assert static.means.abs().max() <= 1.0
     assert static.means.std(0).min() > 0.3
 
 
 def test_a_scene_starts_without_dynamic_gaussians():
-    assert len(initialize.initial_scene(CONFIG, make_capture(random_points(9)), generator()).dynamic) == 0
+    assert len(initial_scene(CONFIG, make_capture(random_points(9))).dynamic) == 0
 
 
 def test_initial_networks_depend_on_the_seed_only():
@@ -273,7 +277,7 @@ def test_initial_networks_depend_on_the_seed_only():
     weights = []
     for seed, disturbance in ((1, 0), (1, 1), (2, 1)):
         torch.manual_seed(disturbance)
-        scene = initialize.initial_scene(dataclasses.replace(CONFIG, seed=seed), capture, generator())
+        scene = initial_scene(dataclasses.replace(CONFIG, seed=seed), capture)
         weights.append(scene.deformation.trunk.values)
     assert torch.equal(weights[0], weights[1])
     assert not torch.equal(weights[0], weights[2])
@@ -599,7 +603,7 @@ def test_offsets_are_in_half_view_sizes_or_as_in_the_paper_in_scene_units(deform
     model = dataclasses.replace(CONFIG.model, deformation=deformation)
     config = dataclasses.replace(CONFIG, model=model, densify=plain.densify(unit=unit, split_size=0.01))
     capture = make_capture(points_at([12, 2], [20, 20]))
-    field = initialize.initial_scene(config, capture, generator()).deformation
+    field = initial_scene(config, capture).deformation
     units = (field.network if deformation == "splines" else field).units
     length = {"pixel": capture.view_size / 2, "extent": 1.0}[unit]
     assert units.tolist() == pytest.approx([length] * 3 + [1.0] * 7)
@@ -607,14 +611,14 @@ def test_offsets_are_in_half_view_sizes_or_as_in_the_paper_in_scene_units(deform
 
 def test_if_everything_is_assumed_dynamic_the_points_become_dynamic_gaussians():
     capture = make_capture(random_points(9)).assuming("dynamic")
-    assert len(initialize.initial_scene(CONFIG, capture, generator()).static) == 0
+    assert len(initial_scene(CONFIG, capture).static) == 0
     assert torch.equal(dynamic_gaussians(capture, ALIGNMENT).means, capture.points)
 
 
 @pytest.mark.parametrize("assumption", ["static", "dynamic"])
 def test_under_an_assumption_points_take_their_colours_from_all_pixels(assumption):
     capture = make_capture(points_at([12, 2], [20, 20])).assuming(assumption)
-    scene = initialize.initial_scene(CONFIG, capture, generator())
+    scene = initial_scene(CONFIG, capture)
     gaussians = scene.static if assumption == "static" else dynamic_gaussians(capture, ALIGNMENT)
     colors = 0.5 + 0.28209479 * gaussians.sh_dc[:, 0]
     assert error(colors, torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])) < 1e-6
@@ -625,6 +629,6 @@ def test_under_an_assumption_points_take_their_colours_from_all_pixels(assumptio
 def test_initial_gaussians_have_the_sh_degree_of_the_model(degree, assumption):
     config = dataclasses.replace(CONFIG, model=dataclasses.replace(NETWORK, sh_degree=degree))
     capture = make_capture(random_points(9), inverse_depth=constant_depth()).assuming(assumption)
-    scene = initialize.initial_scene(config, capture, generator())
+    scene = initial_scene(config, capture)
     for gaussians in (scene.static, scene.dynamic, dynamic_gaussians(capture, ALIGNMENT, config)):
         assert gaussians.sh.shape[1] == (degree + 1) ** 2

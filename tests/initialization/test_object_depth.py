@@ -80,8 +80,13 @@ def changed(capture: Capture, change: Callable[[Frame], Frame]) -> Capture:
     return capture
 
 
+def views_of(capture: Capture, resident_bytes: int = 1 << 30) -> Views:
+    return Views(capture, torch.device("cpu"), resident_bytes)
+
+
 def object_depth(capture: Capture) -> dict[int, torch.Tensor]:
-    return depth_by_size(capture, module.find_all_objects(capture))
+    views = views_of(capture)
+    return depth_by_size(capture, views, module.find_all_objects(views))
 
 
 def depths_at(capture: Capture, masks) -> np.ndarray:
@@ -206,18 +211,13 @@ def test_depth_by_size_is_used_where_an_object_is_known_both_whole_and_cut_off(m
     mask = ball(1.0)
     pixels = dict.fromkeys(range(NUM), np.flatnonzero(mask).astype(np.int32))
     items = [objects.MovingObject(pixels, whole) for whole in ([], list(range(NUM)))]
-    monkeypatch.setattr(module, "find_all_objects", lambda capture: items)
+    monkeypatch.setattr(module, "find_all_objects", lambda views: items)
     assert np.ptp(object_depth(capture_of([mask] * NUM))[0].numpy()[mask]) > 0.05  # round, not flat
-
-
-def test_frames_without_masks_show_no_objects():
-    capture = changed(capture_of([ball(1.0)] * NUM), lambda frame: dataclasses.replace(frame, static_mask=None))
-    assert find_objects(capture, range(NUM)) == []
 
 
 def test_an_object_is_cut_off_in_the_frames_that_show_it_at_the_border():
     masks = [ellipse(4 * k, 60, (18.0, 18.0)) for k in range(NUM)]
-    (item,) = find_objects(capture_of(masks), range(NUM))
+    (item,) = find_objects(views_of(capture_of(masks)), range(NUM))
     assert item.cut == [k for k, mask in enumerate(masks) if mask[:, 0].any() or mask[:, -1].any()]
     assert sorted([*item.cut, *item.whole]) == list(range(NUM))
     assert 0 < len(item.cut) < NUM
@@ -248,7 +248,7 @@ def two_balls(offsets: np.ndarray, radius: float = 18.0):
 def test_objects_that_touch_are_told_apart_by_optical_flow():
     offsets = np.concatenate([np.linspace(-50, -30, 15), np.linspace(-30, -50, 15)])
     masks, images = two_balls(offsets)
-    objects = find_objects(capture_of(masks, images=images), range(NUM))
+    objects = find_objects(views_of(capture_of(masks, images=images)), range(NUM))
     assert len(objects) == 2
     joined = [k for k in range(NUM) if k not in objects[0].whole]
     assert joined
@@ -266,7 +266,7 @@ def test_objects_that_touch_are_told_apart_by_optical_flow():
 
 def test_what_is_hidden_by_half_is_not_followed():
     masks, images = two_balls(np.linspace(-50, 0, NUM))
-    objects = find_objects(capture_of(masks, images=images), range(NUM))
+    objects = find_objects(views_of(capture_of(masks, images=images)), range(NUM))
     both = objects[2]
     assert [item.is_mixture for item in objects] == [False, False, True]
     assert max(objects[0].pixels) == max(objects[1].pixels) == min(both.pixels) - 1
@@ -275,18 +275,14 @@ def test_what_is_hidden_by_half_is_not_followed():
 
 def test_objects_that_part_are_told_apart_backward_in_time():
     masks, images = two_balls(np.concatenate([np.full(5, -33.0), np.linspace(-33, -60, NUM - 5)]))
-    capture = capture_of(masks, images=images)
-    assert len(find_objects(capture, range(NUM))) == 3
-    objects = find_objects(capture, range(NUM)[::-1])
+    views = views_of(capture_of(masks, images=images))
+    assert len(find_objects(views, range(NUM))) == 3
+    objects = find_objects(views, range(NUM)[::-1])
     assert len(objects) == 2
     assert all(sorted(item.pixels) == list(range(NUM)) for item in objects)
 
 
 # In training ----------------------------------------------------------------------------------------------------------
-
-
-def views_of(capture: Capture, resident_bytes: int = 1 << 30) -> Views:
-    return Views(capture, torch.device("cpu"), resident_bytes)
 
 
 def no_alignments() -> torch.Tensor:
@@ -343,6 +339,13 @@ NOT_ASKED_FOR = pytest.mark.parametrize(
 def test_objects_get_no_depth_where_it_is_not_asked_for(config, change):
     capture = change(capture_of(MASKS))
     assert fill_object_depth(config, capture, views_of(capture), no_alignments(), 0.0).num_views == 0
+
+
+def test_frames_whose_depth_is_entirely_unknown_get_that_of_objects():
+    capture = capture_of(MASKS, inverse_depth=lambda static: torch.full(static.shape, torch.nan))
+    views, alignments = views_of(capture), no_alignments()
+    assert fill_object_depth(CONFIG, capture, views, alignments, 0.0).num_views == NUM
+    assert alignments.tolist() == [[1.0, 0.0]] * NUM
 
 
 def test_known_depth_of_what_moves_is_kept():
@@ -526,7 +529,7 @@ def test_objects_that_few_frames_show_apart_from_others_keep_their_depth(monkeyp
     both = (MASKS, [BESIDE] * NUM)
     pixels = [{k: np.flatnonzero(mask).astype(np.int32) for k, mask in enumerate(masks)} for masks in both]
     items = [objects.MovingObject(pixels[0], list(range(11))), objects.MovingObject(pixels[1], list(range(NUM)))]
-    monkeypatch.setattr(module, "find_all_objects", lambda capture: items)
+    monkeypatch.setattr(module, "find_all_objects", lambda views: items)
     count, _, views = filled(misplaced([mask | BESIDE for mask in MASKS]), 0.15)
     assert count == NUM
     found = [float((1.0 / view.inverse_depth[mask]).mean()) for view, mask in zip(views, MASKS, strict=True)]

@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from warpgs.captures.opening import load_capture
 from warpgs.initialization import prepare_start as module
 from warpgs.initialization.prepare_start import prepare_start
@@ -29,12 +29,15 @@ def test_remedies_that_apply_change_the_start_in_their_order(capture, monkeypatc
     assert prepare_start(tiny.CONFIG, capture).notes == ("first", "last")
 
 
-def test_empty_masks_are_found_without_decoding_frames_again(capture):
-    start, read = prepare_start(tiny.CONFIG, capture), Mock()
-    module.REMEDIES["empty masks"].apply(
-        dataclasses.replace(start, capture=dataclasses.replace(start.capture, read=read))
-    )
-    read.assert_not_called()
+@pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
+def test_remedies_use_what_the_views_hold_instead_of_decoding_frames_again(data, resident_bytes):
+    config = dataclasses.replace(tiny.CONFIG, resident_bytes=resident_bytes, loss=plain.loss(object_depth=True))
+    start = prepare_start(config, load_capture(data))
+    start.capture._cached = Mock()
+    start.alignments.fill_(torch.nan)  # so that depth by size is looked for
+    for name in ("exposure", "empty masks", "alignment of depth", "depth by size", "motion fit"):
+        module.REMEDIES[name].apply(start)
+    start.capture._cached.assert_not_called()
 
 
 @pytest.mark.parametrize("assume", ["static", "dynamic"])
@@ -46,7 +49,7 @@ def test_masks_that_are_not_used_are_not_doubted(capture, assume):
 def test_a_jump_of_exposure_is_divided_out_of_the_views_and_noted(capture, monkeypatch):
     gains = torch.ones(len(capture.train), 3)
     gains[1] = 2.0
-    monkeypatch.setattr(module, "exposure_gains", lambda capture: gains)
+    monkeypatch.setattr(module, "exposure_gains", lambda views: gains)
     plain, evened = (prepare_start(dataclasses.replace(tiny.CONFIG, exposure=on), capture) for on in (False, True))
     assert torch.allclose(evened.views[1].image, plain.views[1].image / 2.0, atol=1 / 255)
     assert torch.equal(evened.views[0].image, plain.views[0].image)

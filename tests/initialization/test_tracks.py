@@ -16,10 +16,11 @@ from warpgs.initialization import tracks as module
 from warpgs.initialization.prepare_start import prepare_again, prepare_start
 from warpgs.initialization.silhouettes import Region
 from warpgs.initialization.tracked_start import MAX_FINAL_RATE, MAX_RATE
-from warpgs.initialization.tracks import _divided, find_tracks
+from warpgs.initialization.tracks import _divided
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import render
 from warpgs.synthetic.balls import RADIUS, BallsSize, _balls, balls_capture
+from warpgs.views.views import Views
 
 SIZE = BallsSize(side=100, num_frames=50, num_val=6, turns=4.0)
 UNITS = 1.3
@@ -39,6 +40,10 @@ def capture(data):
 @pytest.fixture(scope="module")
 def tracks(capture):
     return find_tracks(capture)
+
+
+def find_tracks(capture):
+    return module.find_tracks(capture, Views(capture, torch.device("cpu"), 1 << 30))
 
 
 def ball_centers(times: np.ndarray) -> np.ndarray:

@@ -176,6 +176,36 @@ def test_without_a_margin_there_is_no_border(capture):
 
 
 @pytest.mark.parametrize("resident_bytes", [0, PLENTY])
+def test_frames_are_those_of_the_capture_without_depth_also_where_images_are_divided(capture, resident_bytes):
+    bare = capture.assuming("static")
+    views, order = Views(bare, CPU, resident_bytes), range(len(bare.train))[::-1]
+    views.divide_by(torch.full((len(views), 3), 2.0))
+    for index, frame in zip(order, views.frames(order), strict=True):
+        expected = bare.frame(bare.train[index])
+        assert (frame.name, frame.camera) == (expected.name, expected.camera)
+        assert torch.equal(frame.image, expected.image)
+        assert torch.equal(frame.static_mask, expected.static_mask)
+        assert frame.inverse_depth is None
+
+
+def test_gains_also_divide_images_that_were_read_ahead(capture):
+    bare = capture.assuming("static")
+    views, gains = Views(bare, CPU, 0), torch.full((len(bare.train), 3), 2.0)
+    plain = views[1].image
+    views.announce([0, 1])
+    views.divide_by(gains)
+    assert torch.equal(views[1].image, plain / 2.0)
+
+
+def test_views_are_in_the_order_of_time_not_in_that_of_names(capture):
+    names = capture.train[:3]
+    times = zip(names, (0.5, 0.0, 0.2), strict=True)
+    moved = {name: dataclasses.replace(capture.cameras[name], time=time) for name, time in times}
+    views = Views(capture.assuming("static").split(names, ()).with_cameras(moved), CPU, PLENTY)
+    assert views.by_time == [1, 2, 0]
+
+
+@pytest.mark.parametrize("resident_bytes", [0, PLENTY])
 def test_gains_divide_images(capture, resident_bytes):
     bare = capture.assuming("static")
     gains = torch.rand(len(bare.train), 3) + 0.5

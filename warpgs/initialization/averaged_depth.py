@@ -51,7 +51,7 @@ def average_depths(
     cameras = [capture.cameras[name] for name in capture.train]
     depths = [_scaled_depth(*of) for of in zip(views, alignments, cameras, strict=True)]
     images: dict[int, Tensor] = {}
-    for seen in see_objects(capture, objects):
+    for seen in see_objects(capture, views, objects):
         if seen.item.is_mostly_cut:
             continue
         known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in seen.item.pixels.items()}

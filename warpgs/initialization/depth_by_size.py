@@ -10,6 +10,7 @@ from torch import Tensor
 
 from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import MIN_FRAMES
+from warpgs.views.views import Views
 
 from .objects import MovingObject
 from .point_cloud import filled
@@ -19,11 +20,12 @@ SMOOTHING = 0.05
 """Standard deviation of the time, of all in [0, 1], over which the depth around an object is smoothed."""
 
 
-def depth_by_size(capture: Capture, objects: Sequence[MovingObject]) -> dict[int, Float[Tensor, "h w"]]:
+def depth_by_size(capture: Capture, views: Views, objects: Sequence[MovingObject]) -> dict[int, Float[Tensor, "h w"]]:
     """Depth of the objects in a capture's training frames, if it has some that keep their size.
 
     Args:
-        capture: The capture, with masks and static points.
+        capture: The capture, with static points.
+        views: Its training views.
         objects: All of its objects.
 
     Returns:
@@ -31,7 +33,7 @@ def depth_by_size(capture: Capture, objects: Sequence[MovingObject]) -> dict[int
         of objects that are hardly ever whole, of flat ones as far away as the static points around them.
     """
     images: dict[int, Tensor] = {}
-    for seen in see_objects(capture, objects):
+    for seen in see_objects(capture, views, objects):
         if not seen.item.is_mostly_cut:
             paint(images, seen, _depths(seen))
         elif images:  # without any depth, dynamic Gaussians start in front of the points around them

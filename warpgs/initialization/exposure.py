@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from warpgs.data.capture import Capture, Frame
+from warpgs.data.capture import Frame
+from warpgs.views.views import Views
 
 MIN_JUMP = 0.1
 """Minimum change of the logarithm of intensities between two frames that counts as a jump, about a third of a stop. The
@@ -22,7 +23,7 @@ MIN_PIXELS = 50
 """Minimum number of compared pixels; between two frames with fewer, no jump is assumed."""
 
 
-def exposure_gains(capture: Capture) -> Float[Tensor, "T 3"]:
+def exposure_gains(views: Views) -> Float[Tensor, "T 3"]:
     """How much brighter each training frame is than most, per channel; exactly 1 without jumps.
 
     Intensities are multiplied by about a constant when a camera's exposure or white balance jumps. In the order of
@@ -30,11 +31,10 @@ def exposure_gains(capture: Capture) -> Float[Tensor, "T 3"]:
     are taken as 1, so that gradual changes stay.
 
     Returns:
-        [T, 3] factors of red, green and blue, in the order of ``capture.train``; their median over frames is 1.
+        [T, 3] factors of red, green and blue, in the order of the views; their median over frames is 1.
     """
-    order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
-    logs, log, before = torch.zeros(len(order), 3, dtype=torch.float32), torch.zeros(3, dtype=torch.float32), None
-    for k, frame in zip(order, capture.frames([capture.train[k] for k in order]), strict=True):
+    logs, log, before = torch.zeros(len(views), 3, dtype=torch.float32), torch.zeros(3, dtype=torch.float32), None
+    for k, frame in zip(views.by_time, views.frames(views.by_time), strict=True):
         after = _log_intensities(frame)
         if before is not None:
             log = log + _jump(before, after)
@@ -49,9 +49,9 @@ def _log_intensities(frame: Frame) -> np.ndarray:
     height, width = frame.image.shape[:2]
     size = (min(WIDTH, width), max(1, round(height * min(WIDTH, width) / width)))
     values = cv2.resize(frame.image.numpy(), size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
-    if frame.static_mask is not None:
-        static = cv2.resize(frame.static_mask.numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        values[static < 1.0] = np.nan
+    assert frame.static_mask is not None
+    static = cv2.resize(frame.static_mask.numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    values[static < 1.0] = np.nan
     values[(values < DARKEST) | (values > BRIGHTEST)] = np.nan
     return np.log(values)
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
-from warpgs.data.sampling import evenly_spaced
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.mlp_deformation import MlpDeformation
 from warpgs.model.scene import SplitScene
@@ -31,7 +31,7 @@ RESOLUTION = 0.25
 place. A Gaussian as small as the error between the scans would be culled and pruned."""
 
 
-def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Generator) -> SplitScene:
+def initial_scene(config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator) -> SplitScene:
     """Static Gaussians at the sparse points (at random ones in the scene's box if there are none), no dynamic ones yet.
 
     If everything is assumed to be dynamic, there are no static Gaussians either.
@@ -40,7 +40,7 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
     degree = config.model.sh_degree
     static = Gaussians.empty(0, degree)
     if capture.assumption != "dynamic":
-        static = _gaussians_at_points(config, capture, generator)
+        static = _gaussians_at_points(config, capture, views, generator)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         scene = SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
@@ -50,15 +50,17 @@ def initial_scene(config: TrainConfig, capture: Capture, generator: torch.Genera
     return scene
 
 
-def _gaussians_at_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> Gaussians:
+def _gaussians_at_points(config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator) -> Gaussians:
     """Gaussians at a random subset of the capture's points; closer ones than its cameras resolve are at one place."""
-    points, colors = _colored_points(config, capture, generator)
+    points, colors = _colored_points(config, capture, views, generator)
     focal = torch.stack([capture.cameras[name].focal for name in capture.train]).median()
     resolution = RESOLUTION * capture.median_depth / float(focal)
     return gaussians_at(points, colors, config.model, resolution=resolution)
 
 
-def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _colored_points(
+    config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
     """A random subset of the capture's points with colours in [0, 1]; see ``model.point_colors``."""
     points, colors, max_count = capture.points, capture.point_colors, config.model.max_static_points
     if len(points) == 0:
@@ -69,14 +71,13 @@ def _colored_points(config: TrainConfig, capture: Capture, generator: torch.Gene
         return points, 0.5 + SH_C0 / 255.0 * torch.rand(points.shape, dtype=torch.float32, generator=generator)
     if colors is not None:
         return points, colors[chosen].float() / 255.0
-    views = []
-    for name in evenly_spaced(capture.train, MAX_COLOR_VIEWS):
-        frame = capture.frame(name)
+    seen = []
+    for frame in views.frames(evenly_spaced_indices(len(views), MAX_COLOR_VIEWS)):
         mask = frame.static_mask
         if mask is None or capture.assumption == "dynamic":
             mask = torch.ones(frame.image.shape[:2], dtype=torch.bool)
-        views.append((frame.camera, frame.image, mask))
-    return points, color_points(points, views)
+        seen.append((frame.camera, frame.image, mask))
+    return points, color_points(points, seen)
 
 
 def fits_motion(
@@ -118,10 +119,10 @@ def dynamic_gaussians(
     false. The result is None, and the deformation as it was, if ``is_stopped`` says during the fit that it is to stop.
     """
     if isinstance(deformation, SplineDeformation):
-        tracks = find_tracks(capture)
+        tracks = find_tracks(capture, views)
         return DynamicStart(start_from_tracks(tracks, deformation, config, capture.view_size, generator))
     if capture.assumption == "dynamic" and len(capture.points):
-        return DynamicStart(_gaussians_at_points(config, capture, generator))
+        return DynamicStart(_gaussians_at_points(config, capture, views, generator))
     count = max(config.model.dynamic_points, MAX_POINTS * (config.schedule.fit_motion > 0))
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:

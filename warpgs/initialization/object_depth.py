@@ -71,16 +71,16 @@ def fill_object_depth(
     if capture.metric_depth or error <= MIN_ERROR:
         return ObjectDepth(0)
     weight = 1.0 / (1.0 + (error / SIZE_ERROR) ** 2)
-    return ObjectDepth(average_depths(capture, find_all_objects(capture), views, alignments, weight))
+    return ObjectDepth(average_depths(capture, find_all_objects(views), views, alignments, weight))
 
 
 def _set_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]) -> ObjectDepth:
     """Gives objects their depth by size; the arguments are those of ``fill_object_depth``."""
-    objects, count = find_all_objects(capture), 0
+    objects, count = find_all_objects(views), 0
     if (num_cut := num_cut_off(objects)) is not None:
         return ObjectDepth(0, num_cut)
-    for index, depth in depth_by_size(capture, objects).items():
-        if capture.frame(capture.train[index]).inverse_depth is None:
+    for index, depth in depth_by_size(capture, views, objects).items():
+        if bool(views[index].inverse_depth.isnan().all()):
             alignments[index] = alignments.new_tensor([1.0, 0.0])
         if bool(alignments[index].isfinite().all()):
             views.set_object_depth(index, alignments[index], depth)

@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int
 
-from warpgs.data.capture import Capture, Frame
+from warpgs.data.capture import Frame
 from warpgs.data.dynamic_regions import MIN_FRAMES, dynamic_regions, is_cut, scaled_size
 from warpgs.data.optical_flow import MIN_SIDE, flow_between, grey_at
+from warpgs.views.views import Views
 
 MIN_OVERLAP = 0.3
 """Overlap of regions of consecutive frames, relative to the smaller one, from which on they show the same object."""
@@ -46,18 +47,18 @@ class MovingObject:
         return len(self.whole) < MIN_FRAMES
 
 
-def find_objects(capture: Capture, order: Sequence[int]) -> list[MovingObject]:
+def find_objects(views: Views, order: Sequence[int]) -> list[MovingObject]:
     """The objects that the masks of training frames show.
 
     Where several become one region, optical flow tells which pixels belong to which of them, until they part, or one
     hides another.
 
     Args:
-        capture: The capture; frames without a mask show nothing.
-        order: Indices of training frames, by time or backward in time.
+        views: The training views.
+        order: Their indices, by time or backward in time.
     """
     follower = _Follower()
-    for index, frame in zip(order, capture.frames([capture.train[index] for index in order]), strict=True):
+    for index, frame in zip(order, views.frames(order), strict=True):
         follower.add(index, frame)
     return follower.objects
 
@@ -69,10 +70,10 @@ def num_cut_off(objects: Sequence[MovingObject]) -> int | None:
     return len({index for item in objects for index in item.cut})
 
 
-def find_all_objects(capture: Capture) -> list[MovingObject]:
+def find_all_objects(views: Views) -> list[MovingObject]:
     """The objects that the masks show by time, then those backward in time: what parts later is told apart before."""
-    order = sorted(range(len(capture.train)), key=lambda k: capture.cameras[capture.train[k]].time)
-    return [item for frames in (order, order[::-1]) for item in find_objects(capture, frames)]
+    order = views.by_time
+    return [item for indices in (order, order[::-1]) for item in find_objects(views, indices)]
 
 
 class _Follower:
@@ -89,8 +90,8 @@ class _Follower:
 
     def add(self, index: int, frame: Frame) -> None:
         """Goes on to the training frame of an index."""
-        mask, alone = frame.static_mask, set()
-        regions = [] if mask is None else dynamic_regions(mask, frame.camera)
+        assert frame.static_mask is not None
+        regions, alone = dynamic_regions(frame.static_mask, frame.camera), set()
         labels = np.full(scaled_size(frame.camera)[::-1], NOTHING)
         for region, candidates in zip(regions, self._candidates(regions), strict=True):
             if len(candidates) > 1 and not any(self.objects[k].is_mixture for k in candidates):

@@ -48,6 +48,7 @@ def _background(config: TrainConfig, capture: Capture) -> Background:
 
 def mean_color(capture: Capture) -> Color:
     """Mean red, green and blue of a capture's training frames in [0, 1], to 3 decimals, of some frames if many."""
+    # There are no views yet: which of their pixels are empty depends on the background.
     chosen = evenly_spaced_indices(len(capture.train), MAX_AVERAGED)
     frames = capture.frames([capture.train[k] for k in chosen])
     means = [frame.image.numpy().mean((0, 1)) for frame in frames]

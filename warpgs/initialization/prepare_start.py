@@ -65,7 +65,7 @@ def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
         plan,
         capture,
         views,
-        first_scene(plan, capture),
+        first_scene(plan, capture, views),
         torch.full((num, 2), torch.nan, dtype=torch.float32, device=device),
         DepthTrust(*torch.ones(2, num, dtype=torch.float32, device=device)),
         resumed,
@@ -79,7 +79,7 @@ def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
 
 def _even_exposure(start: Start) -> Start:
     """Divides jumps of exposure out of the images."""
-    gains = exposure_gains(start.capture)
+    gains = exposure_gains(start.views)
     count = int((gains != 1.0).any(1).sum())
     if not count:  # saves steps a division
         return start
@@ -95,7 +95,7 @@ def _may_be_tracked(start: Start) -> bool:
 
 def _follow_tracks(start: Start) -> Start:
     """Has dynamic Gaussians start on the tracks of objects that move far from frame to frame."""
-    tracks = find_tracks(start.capture) if start.plan.model.tracks else []
+    tracks = find_tracks(start.capture, start.views) if start.plan.model.tracks else []
     if tracks:
         note = f"{len(tracks)} objects move far from frame to frame: dynamic Gaussians start on their tracks"
         return start.planned(for_tracks(start.plan, tracks)).noted(note)
@@ -163,6 +163,7 @@ def _do_without_depth(start: Start) -> Start:
     if not start.plan.depth:
         return start.noted(f"depth is switched off: {NO_DEPTH}")
     reason = "" if start.has_depth else f": {NO_DEPTH}"
+    # The frame is decoded again, because depth by size is in the views by now.
     if num_aligned or capture.frame(capture.train[0]).inverse_depth is not None:
         aligned = f"{num_aligned} of {len(start.views)} views"
         return start.noted(f"depth can be aligned with the sparse points in {aligned}{reason}")

@@ -16,6 +16,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import scaled_size
+from warpgs.views.views import Views
 
 from .objects import MovingObject
 from .point_cloud import filled, front_of_ball
@@ -37,24 +38,25 @@ Points = tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, " P"]]
 """Rows, columns and depths [scene units] of points."""
 
 
-def see_objects(capture: Capture, objects: Sequence[MovingObject]) -> Iterator["SeenObject"]:
+def see_objects(capture: Capture, views: Views, objects: Sequence[MovingObject]) -> Iterator["SeenObject"]:
     """The objects as a capture's training frames see them, mostly cut ones last.
 
     Objects that cannot be told apart are omitted.
 
     Args:
-        capture: The capture, with masks and static points.
+        capture: The capture, with static points.
+        views: Its training views.
         objects: All of its objects.
     """
-    points_of = cache(partial(_static_points, capture))
+    points_of = cache(partial(_static_points, capture, views))
     for item in sorted((item for item in objects if not item.is_mixture), key=attrgetter("is_mostly_cut")):
-        views = {k: ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
-        yield SeenObject(item, views, points_of)
+        seen_by = {k: ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
+        yield SeenObject(item, seen_by, points_of)
 
 
-def _static_points(capture: Capture, index: int) -> Points:
+def _static_points(capture: Capture, views: Views, index: int) -> Points:
     """Rows and columns in the scaled mask, and depths, of the static points that a training frame shows."""
-    frame = capture.frame(capture.train[index])
+    frame = views.frame(index)
     assert frame.static_mask is not None
     row, column, depth, inside = frame.camera.project(capture.points[:: -(-len(capture.points) // MAX_POINTS) or 1])
     shown = inside & frame.static_mask[row, column]

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from warpgs.data.capture import Capture, Frame
+from warpgs.data.capture import Frame
 from warpgs.data.masks import connected_regions
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.views.views import Views
 
 MIN_PIXELS = 12
 """Minimum size of a region."""
@@ -49,14 +50,13 @@ class Region(NamedTuple):
         )
 
 
-def find_regions(capture: Capture) -> list[list[Region]]:
-    """The regions of each training frame."""
-    return [_regions(frame) for frame in capture.frames(capture.train)]
+def find_regions(views: Views) -> list[list[Region]]:
+    """The regions of each training view."""
+    return [_regions(frame) for frame in views.frames(range(len(views)))]
 
 
 def _regions(frame: Frame) -> list[Region]:
-    if frame.static_mask is None:
-        return []
+    assert frame.static_mask is not None
     camera, image = frame.camera, frame.image.numpy()
     to_rays = np.linalg.inv(camera.K.double().numpy() @ camera.viewmat[:3, :3].double().numpy())
     origin = camera.position.double().numpy()

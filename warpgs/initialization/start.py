@@ -59,16 +59,16 @@ class Start:
 
     def planned(self, plan: Plan) -> "Start":
         """The same with another plan, and the initial scene that it implies."""
-        return replace(self, plan=plan, scene=first_scene(plan, self.capture))
+        return replace(self, plan=plan, scene=first_scene(plan, self.capture, self.views))
 
     def noted(self, *notes: str) -> "Start":
         """The same, with more notes."""
         return replace(self, notes=(*self.notes, *notes))
 
 
-def first_scene(plan: Plan, capture: Capture) -> SplitScene:
+def first_scene(plan: Plan, capture: Capture, views: Views) -> SplitScene:
     """The initial scene of a plan."""
-    return initial_scene(plan, capture, random_numbers(plan.seed, "points", 0, 0))
+    return initial_scene(plan, capture, views, random_numbers(plan.seed, "points", 0, 0))
 
 
 class Remedy(NamedTuple):

@@ -17,6 +17,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
 from warpgs.data.capture import Capture
+from warpgs.views.views import Views
 
 from .silhouettes import MIN_PIXELS, Region, find_regions
 
@@ -72,7 +73,7 @@ class Track:
     regions: list[Region]
 
 
-def find_tracks(capture: Capture) -> list[Track]:
+def find_tracks(capture: Capture, views: Views) -> list[Track]:
     """Tracks of the objects that a capture shows before transparent surroundings, one per colour.
 
     Returns:
@@ -81,7 +82,7 @@ def find_tracks(capture: Capture) -> list[Track]:
     """
     if capture.assumption != "dynamic" or not capture.has_empty or not _jumps(capture):
         return []
-    by_frame = find_regions(capture)
+    by_frame = find_regions(views)
     regions = [region for of_frame in by_frame for region in of_frame]
     count = int(np.quantile([len(of_frame) for of_frame in by_frame], SHOWING_ALL))
     if not 0 < count <= MAX_OBJECTS or len(regions) < MIN_REGIONS * count:

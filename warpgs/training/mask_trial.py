@@ -15,6 +15,7 @@ from warpgs.errors import one_line
 from warpgs.initialization.objects import find_all_objects, num_cut_off
 from warpgs.initialization.prepare_start import prepare_start
 from warpgs.runtime import ranks
+from warpgs.views.views import Views
 
 from .callbacks import Progress, render_and_compare
 from .interrupt import Interrupt
@@ -88,11 +89,11 @@ def _is_wanted(config: TrainConfig, capture: Capture) -> bool:
     return is_asked and is_long and len(capture.train) >= MIN_FRAMES
 
 
-def _warn_of_unknown_depth(capture: Capture, log: Callable[[str], None]) -> None:
+def _warn_of_unknown_depth(views: Views, log: Callable[[str], None]) -> None:
     """Warns if an object is not whole in enough of all frames either: the trial has held some out."""
-    num_cut = num_cut_off(find_all_objects(capture))
+    num_cut = num_cut_off(find_all_objects(views))
     if num_cut is not None:
-        log(f"warning: {unknown_depth(num_cut, len(capture.train))}")
+        log(f"warning: {unknown_depth(num_cut, len(views))}")
 
 
 def held_out_psnr(
@@ -126,7 +127,7 @@ def held_out_psnr(
     with tempfile.TemporaryDirectory(prefix="warpgs-trial-") as folder, Interrupt() as interrupt:
         start = prepare_start(config, capture)
         if start.num_cut is not None:
-            _warn_of_unknown_depth(whole, log)
+            _warn_of_unknown_depth(Views(whole, start.views.device, start.plan.resident_bytes), log)
         trainer = Trainer(start, Path(folder))
         trainer.callbacks = [compare]
         with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet, trainer.protocol.remaining_cost) as logger:

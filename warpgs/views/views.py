@@ -11,7 +11,7 @@ from torch import Tensor
 
 from warpgs.cache import cache_folder
 from warpgs.cameras import Camera
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Frame
 from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import resize_inverse
 from warpgs.model.poses import PoseCorrections
@@ -109,9 +109,12 @@ class Views:
         return len(self._capture.train)
 
     def __getitem__(self, index: int) -> View:
-        stored = self._at(index) if self.resident else self._read_ahead.take(index)
-        on_device = stored.map(lambda tensor: tensor.to(self.device))
+        on_device = self._stored(index).map(lambda tensor: tensor.to(self.device))
         return self._view(on_device, torch.full((1,), index, device=self.device))
+
+    def _stored(self, index: int) -> StoredView:
+        """A view on the device if it is resident, else in host memory."""
+        return self._at(index) if self.resident else self._read_ahead.take(index)
 
     def _at(self, index: int) -> StoredView:
         """The memory of a resident view."""
@@ -142,6 +145,23 @@ class Views:
             self.select(index)
             yield graphs.run("view", lambda: work(self.selected())) if graphs else work(self.selected())
 
+    @property
+    def by_time(self) -> list[int]:
+        """The indices of all views in the order of time."""
+        return sorted(range(len(self)), key=lambda index: self._camera(index).time)
+
+    def frames(self, indices: Sequence[int]) -> Iterator[Frame]:
+        """The frames of these indices, on the CPU, with jumps of exposure and without depth; not to be changed."""
+        return (self.frame(index) for index in self._announced(indices))
+
+    def frame(self, index: int) -> Frame:
+        """The frame of an index, as ``frames`` gives it."""
+        stored = self._stored(index)
+        return Frame(self._capture.train[index], self._camera(index), stored.image.cpu(), stored.static_mask.cpu())
+
+    def _camera(self, index: int) -> Camera:
+        return self._capture.cameras[self._capture.train[index]]
+
     def announce(self, indices: Iterable[int]) -> None:
         """Says which views come next, so that those that are not resident are read ahead."""
         if not self.resident:
@@ -160,8 +180,9 @@ class Views:
         return self._view(self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index)
 
     def divide_by(self, gains: Float[Tensor, "T 3"]) -> None:
-        """Divides images by a factor per channel; call it before any view is read ahead."""
+        """Divides images by a factor per channel."""
         self._reader.gains = gains
+        self._read_ahead.announce(())  # what was read ahead is not divided
         if self.resident:
             self._all = self._all._replace(gain=gains.to(self.device))
 
