@@ -14,12 +14,13 @@ from warpgs.captures.opening import load_capture
 from warpgs.config import MaskPerturbation, RenderSettings, TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.locks import lock_folder
-from warpgs.runs import checkpoint
+from warpgs.runs import checkpoint, former
 from warpgs.runs import run as runs
-from warpgs.runs.config_file import read_config, read_notes, write_start
+from warpgs.runs.config_file import read_config, read_notes, require_resumable, write_start
 from warpgs.runs.run import Run, locked_new_folder, new_folder, open_run
 from warpgs.runtime.devices import choose_device
 from warpgs.training.schedule import Protocol
+from warpgs.training.train import train
 
 UNUSUAL = dataclasses.replace(
     tiny.CONFIG,
@@ -174,19 +175,29 @@ def test_a_background_and_a_device_that_were_not_looked_up_are_black_and_that_of
     assert (read_config(run).background, read_config(run).device) == ("black", "cuda")
 
 
-@pytest.mark.parametrize(
-    ("part", "name"),
-    [
-        ("schedule", "half_size_until"),
-        ("schedule", "mask_trial"),
-        ("loss", "mask_tolerance"),
-        ("densify", "depth_gradients"),
-    ],
-)
-def test_runs_with_an_option_that_is_gone_open(run, part, name):
+@pytest.mark.parametrize("option", former.REMOVED)
+def test_runs_with_an_option_that_is_gone_open(run, option):
     before = read_config(run)
-    edit(run, lambda values: values[part].update({name: 0}))
+    *section, name = option.split(".")
+    edit(run, lambda values: (values[section[0]] if section else values).update({name: 0}))
     assert read_config(run) == before
+
+
+@pytest.mark.parametrize("option", ["gone", "loss.gone"])
+def test_runs_that_need_an_option_that_is_gone_open_but_are_not_resumed(run, monkeypatch, option):
+    """Training would go on as that of another run."""
+    monkeypatch.setitem(former.REMOVED, option, former.Removed("it is always 1", lambda value, section: value == 1))
+    before = read_config(run)
+    *section, name = option.split(".")
+    edit(run, lambda values: (values[section[0]] if section else values).update({name: 1}))
+    require_resumable(run)
+    edit(run, lambda values: (values[section[0]] if section else values).update({name: 2}))
+    assert read_config(run) == before
+    message = (
+        rf"config\.json cannot be resumed: {option} is 2; this version has no such option any more: it is always 1; "
+    )
+    with pytest.raises(ValueError, match=message):
+        train(TrainConfig(resume=run))
 
 
 def test_the_field_that_a_misspelt_one_may_mean_is_named(run):

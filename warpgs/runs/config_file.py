@@ -13,95 +13,12 @@ from warpgs.config import Plan, TrainConfig, validate
 from warpgs.config.builtin import is_builtin
 from warpgs.errors import missing, suggestion
 from warpgs.files import read_json, write_text
-from warpgs.runtime.devices import choose_device
+
+from .former import FORMER, RENAMED, as_today, not_kept
 
 NAME, START = "config.json", "start.json"
 MAX_BYTES = 1 << 20
 """Size of config.json [bytes]."""
-
-REMOVED_PRESETS = ("fast",)
-REMOVED = {
-    "densify": ("depth_gradients",),
-    "loss": ("dynamic_background", "mask_tolerance"),
-    "schedule": ("half_size_until", "mask_trial"),
-}
-
-RENAMED = {"relight_from": "appearance_from", "dense_fraction": "split_size"}
-"""Fields that earlier versions wrote under another name."""
-
-FORMER: dict[str, dict[str, Any]] = {
-    "": {
-        "as_taken": False,
-        "background": "black",
-        "data": None,
-        "dataset": None,
-        "depth": True,
-        "device": None,
-        "exposure": False,
-        "factor": None,
-        "iterations": None,
-        "lpips": None,
-        "lpips_net": "vgg",
-        "max_alpha": 0.999,
-        "out": None,
-        "preset": None,
-        "resume": None,
-        "try_masks": False,
-        "undistort": True,
-        "vrig_factor": None,
-    },
-    "densify": {
-        "max_elongation": 0.0,
-        "min_pixels": 0,
-        "noise": 5e5,
-        "reseed": 0.0,
-        "strategy": "3dgs",
-        "unit": "extent",
-        "weakest": 0.0,
-    },
-    "loss": {
-        "acceleration": 0.0,
-        "branches_in_stage2": "yes",
-        "depth_gate": True,
-        "depth_margin": 0.0,
-        "depth_smooth": False,
-        "depth_tolerance": 0.0,
-        "hidden_appearance": True,
-        "mask_margin": 0.0,
-        "object_depth": False,
-        "opacity": 0.0,
-        "scale": 0.0,
-        "squared": 0.0,
-    },
-    "model": {
-        "appearance_depth": None,
-        "appearance_width": None,
-        "bound_sizes": True,
-        "deformation": "mlp",
-        "dropout": 0.0,
-        "dynamic_start": "points",
-        "min_period": 0.0,
-        "path_points": 4,
-        "paths": 1,
-        "point_colors": "capture",
-        "raw_input": True,
-        "tracks": True,
-    },
-    "optim": {"means_anneal": "run", "means_scale": None, "poses": 0.0},
-    "schedule": {"fit_motion": 0, "joint_from": None, "settle": 0},
-}
-"""Values that runs of versions without these fields had, by section, "" for those outside. A field that is not here has
-been written by every version since 0.1.0: with a default in its place, a run would be resumed as another run."""
-
-
-def former_option(name: str) -> str:
-    """The end of the message that there is no option ``name``: what became of it; empty if no version had it."""
-    *section, field = name.lstrip("-").replace("-", "_").split(".")
-    if field in RENAMED:
-        return f"; it is --{'.'.join([*section, RENAMED[field]]).replace('_', '-')} now"
-    if field.removeprefix("no_") in REMOVED.get(".".join(section), ()):
-        return " any more: omit it"
-    return ""
 
 
 def write_config(folder: Path, config: Plan) -> None:
@@ -164,37 +81,20 @@ def read_config(folder: Path) -> Plan:
         raise ValueError(missing(folder))
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
-    plan: Plan = _parse(Plan, _with_old_meaning(read_json(path, max_bytes=MAX_BYTES)), path)
+    plan: Plan = _parse(Plan, as_today(read_json(path, max_bytes=MAX_BYTES)), path)
     _validate(plan, path)
     return dataclasses.replace(plan, out=folder)
 
 
-def _with_old_meaning(values: dict[str, Any]) -> dict[str, Any]:
-    """Values as today's version writes those of an earlier one, so that its runs are resumed as they were begun.
+def require_resumable(folder: Path) -> None:
+    """Refuses to train a run on that has a value of an option that is gone, with which it would become another run.
 
-    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that
-    is gone is none: the file has all of its values. ``loss.branches_in_stage2`` was a yes or no, and later what runs as
-    well as what was asked for. A background that was not looked up is black. The options of ``REMOVED`` changed nothing
-    that is still to be done, but for ``densify.depth_gradients``: terms of depth count from now on where densification
-    did not look at them.
+    Raises:
+        ValueError: If it does; the message names the option. Such runs can be evaluated, viewed and exported.
     """
-    if values.get("preset") in REMOVED_PRESETS:
-        values = {**values, "preset": None}
-    if values.get("background") == "capture":
-        values = {**values, "background": "black"}
-    if values.get("device") is None:
-        values = {**values, "device": choose_device()}
-    if isinstance(loss := values.get("loss"), dict):
-        if isinstance(branches := loss.get("branches_in_stage2"), bool):
-            loss = {**loss, "branches_in_stage2": "yes" if branches else "no"}
-        values = {"branches_in_stage2": loss.get("branches_in_stage2") != "no", **values}
-        if values.get("dap") is False and "depth_gate" not in loss:
-            loss = {**loss, "depth": 0.0}
-        values = {**values, "loss": loss}
-    for section, names in REMOVED.items():
-        if isinstance(part := values.get(section), dict):
-            values = {**values, section: {name: value for name, value in part.items() if name not in names}}
-    return values
+    path = folder / NAME
+    if reason := not_kept(read_json(path, max_bytes=MAX_BYTES)):
+        raise ValueError(f"{path} cannot be resumed: {reason}; the version that began the run can")
 
 
 def parse_config(values: dict[str, Any], source: Path | str) -> TrainConfig:

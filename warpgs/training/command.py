@@ -72,7 +72,7 @@ def main(arguments: Sequence[str], prog: str = "train.py") -> int:
 
 def _former(name: str) -> str:
     """See ``former_option``."""
-    from warpgs.runs.config_file import former_option  # imports torch, which --help does not need
+    from warpgs.runs.former import former_option  # imports torch, which --help does not need
 
     return former_option(name)
 

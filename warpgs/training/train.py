@@ -21,7 +21,7 @@ from warpgs.initialization.prepare_start import prepare_again, prepare_start
 from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
-from warpgs.runs.config_file import read_config, write_config, write_start
+from warpgs.runs.config_file import read_config, require_resumable, write_config, write_start
 from warpgs.runs.run import MASK_TRIAL, Run, locked_new_folder
 from warpgs.runtime import ranks
 from warpgs.runtime.devices import choose_device
@@ -252,6 +252,7 @@ def _continued(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.Exi
     assert config.resume is not None
     folder = config.resume
     found = Run(folder, read_config(folder))  # before it is locked: nothing is written into other folders
+    require_resumable(folder)
     if ranks.is_first():
         locks.enter_context(found.lock())
     saved = extended(read_config(folder), config.iterations)

@@ -1,0 +1,145 @@
+"""Options of earlier versions: their values as today's version writes them, and advice on those that are gone."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from warpgs.runtime.devices import choose_device
+
+REMOVED_PRESETS = ("fast",)
+
+RENAMED = {"relight_from": "appearance_from", "dense_fraction": "split_size"}
+"""Fields that earlier versions wrote under another name."""
+
+
+class Removed(NamedTuple):
+    """An option that is gone.
+
+    Attributes:
+        advice: What to do instead of giving it.
+        is_kept: Whether a run with this value trains on as it was begun, given the other fields of the section.
+    """
+
+    advice: str = "omit it"
+    is_kept: Callable[[Any, dict[str, Any]], bool] = lambda value, section: True
+
+
+REMOVED: dict[str, Removed] = {
+    "densify.depth_gradients": Removed(),
+    "loss.dynamic_background": Removed(),
+    "loss.mask_tolerance": Removed(),
+    "schedule.half_size_until": Removed(),
+    "schedule.mask_trial": Removed(),
+}
+"""Options that are gone, by name with their section."""
+
+FORMER: dict[str, dict[str, Any]] = {
+    "": {
+        "as_taken": False,
+        "background": "black",
+        "data": None,
+        "dataset": None,
+        "depth": True,
+        "device": None,
+        "exposure": False,
+        "factor": None,
+        "iterations": None,
+        "lpips": None,
+        "lpips_net": "vgg",
+        "max_alpha": 0.999,
+        "out": None,
+        "preset": None,
+        "resume": None,
+        "try_masks": False,
+        "undistort": True,
+        "vrig_factor": None,
+    },
+    "densify": {
+        "max_elongation": 0.0,
+        "min_pixels": 0,
+        "noise": 5e5,
+        "reseed": 0.0,
+        "strategy": "3dgs",
+        "unit": "extent",
+        "weakest": 0.0,
+    },
+    "loss": {
+        "acceleration": 0.0,
+        "branches_in_stage2": "yes",
+        "depth_gate": True,
+        "depth_margin": 0.0,
+        "depth_smooth": False,
+        "depth_tolerance": 0.0,
+        "hidden_appearance": True,
+        "mask_margin": 0.0,
+        "object_depth": False,
+        "opacity": 0.0,
+        "scale": 0.0,
+        "squared": 0.0,
+    },
+    "model": {
+        "appearance_depth": None,
+        "appearance_width": None,
+        "bound_sizes": True,
+        "deformation": "mlp",
+        "dropout": 0.0,
+        "dynamic_start": "points",
+        "min_period": 0.0,
+        "path_points": 4,
+        "paths": 1,
+        "point_colors": "capture",
+        "raw_input": True,
+        "tracks": True,
+    },
+    "optim": {"means_anneal": "run", "means_scale": None, "poses": 0.0},
+    "schedule": {"fit_motion": 0, "joint_from": None, "settle": 0},
+}
+"""Values that runs of versions without these fields had, by section, "" for those outside. A field that is not here has
+been written by every version since 0.1.0: with a default in its place, a run would be resumed as another run."""
+
+
+def former_option(name: str) -> str:
+    """The end of the message that there is no option ``name``: what became of it; empty if no version had it."""
+    *section, field = name.lstrip("-").replace("-", "_").split(".")
+    if field in RENAMED:
+        return f"; it is --{'.'.join([*section, RENAMED[field]]).replace('_', '-')} now"
+    removed = REMOVED.get(".".join([*section, field.removeprefix("no_")]))
+    return f" any more: {removed.advice}" if removed else ""
+
+
+def not_kept(values: dict[str, Any]) -> str | None:
+    """The first removed option of a config.json without which a run would not train on as it was begun."""
+    for name, removed in REMOVED.items():
+        *section, field = name.split(".")
+        part = values[section[0]] if section else values
+        if field in part and not removed.is_kept(part[field], part):
+            return f"{name} is {part[field]}; this version has no such option any more: {removed.advice}"
+    return None
+
+
+def as_today(values: dict[str, Any]) -> dict[str, Any]:
+    """Values as today's version writes those of an earlier one, so that its runs are resumed as they were begun.
+
+    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that
+    is gone is none: the file has all of its values. ``loss.branches_in_stage2`` was a yes or no, and later what runs as
+    well as what was asked for. A background that was not looked up is black. After ``densify.depth_gradients``, terms
+    of depth count from now on where densification did not look at them.
+    """
+    values = {name: dict(value) if isinstance(value, dict) else value for name, value in values.items()}
+    if values.get("preset") in REMOVED_PRESETS:
+        values["preset"] = None
+    if values.get("background") == "capture":
+        values["background"] = "black"
+    if values.get("device") is None:
+        values["device"] = choose_device()
+    if isinstance(loss := values.get("loss"), dict):
+        if isinstance(branches := loss.get("branches_in_stage2"), bool):
+            loss["branches_in_stage2"] = "yes" if branches else "no"
+        values.setdefault("branches_in_stage2", loss.get("branches_in_stage2") != "no")
+        if values.get("dap") is False and "depth_gate" not in loss:
+            loss["depth"] = 0.0
+    for name in REMOVED:
+        *section, field = name.split(".")
+        part = values.get(section[0]) if section else values
+        if isinstance(part, dict):
+            part.pop(field, None)
+    return values
