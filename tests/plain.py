@@ -41,7 +41,6 @@ schedule = partial(
         pretrain=2_000,
         stage1=30_000,
         stage2=40_000,
-        realign_at=1_000,
         densify_from=500,
         densify_until=15_000,
         reset_every=3_000,

@@ -27,14 +27,12 @@ PAPER = {
         "model.appearance_opacity": True,
         "static_geometry": False,
         "static_appearance": False,
-        "loss.static": 1.0,
         "loss.ssim": 0.2,
     },
     "Visual Geometry Decomposition: Eq. 10 to 12, dynamic component": {
         "model.deformation": "mlp",
         "model.paths": 1,  # of the deformation model "splines" alone, like the next
         "model.path_points": 4,
-        "loss.dynamic": 1.0,
         "loss.mask_margin": 0.0,
         "assume": "masks",
     },
@@ -119,11 +117,9 @@ PAPER = {
         "schedule.fit_motion": 0,
     },
     "decided here, where neither the paper nor the code that it builds upon says anything": {
-        "loss.joint": 1.0,
         "densify.visibility": 3e-4,
         "densify.max_gaussians": 3_000_000,
         "schedule.pretrain": 2_000,
-        "schedule.realign_at": 1_000,
         "schedule.prune_every": 5_000,
         "model.max_static_points": 100_000,
         "model.half": True,

@@ -38,7 +38,6 @@ SCHEDULE = plain.schedule(
     pretrain=6,
     stage1=16,
     stage2=10,
-    realign_at=3,
     densify_from=3,
     densify_until=14,
     reset_every=9,

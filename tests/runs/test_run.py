@@ -261,12 +261,12 @@ FIRST = {
     "": "antialias app assume checkpoint_every dap graph keep_checkpoints resident_bytes seed stage2 static_appearance "
     "static_geometry vdp masks model loss optim densify schedule",
     "densify": "every gradient max_gaussians max_size min_opacity split_size visibility",
-    "loss": "depth depth_dynamic depth_end dynamic joint ssim static",
+    "loss": "depth depth_dynamic depth_end ssim",
     "masks": "dilate erode holes",
     "model": "appearance_degree appearance_opacity depth dynamic_points half max_static_points position_bands "
     "sh_degree skip time_bands width",
     "optim": "means networks networks_end opacities quats scales sh_dc sh_rest",
-    "schedule": "appearance_from deform_from densify_from densify_until noise_until pretrain prune_every realign_at "
+    "schedule": "appearance_from deform_from densify_from densify_until noise_until pretrain prune_every "
     "reset_every sh_degree_every stage1 stage2 warmup",
 }
 """Fields that version 0.1.0 wrote, those of today's names, without those that may be null."""

@@ -50,7 +50,7 @@ def test_the_command_line_precedes_the_variant_which_precedes_the_file(tmp_path)
     made = spec(variant, options={"factor": 1, "loss": {"ssim": 0.1, "depth": 9.0}})
     assert (plan(made, out=tmp_path)[0].config.factor, plan(made, out=tmp_path, factor=4)[0].config.factor) == (2, 4)
     loss = plan(made, out=tmp_path)[0].config.loss
-    assert (loss.ssim, loss.depth, loss.static) == (0.5, 9.0, PRESETS["best"].loss.static)
+    assert (loss.ssim, loss.depth, loss.squared) == (0.5, 9.0, PRESETS["best"].loss.squared)
 
 
 @pytest.mark.parametrize("name", ["ablation", "best", "masks", "scenes", "seeds"])

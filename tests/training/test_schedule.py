@@ -16,7 +16,6 @@ SHORT = plain.schedule(
     pretrain=20,
     stage1=100,
     stage2=80,
-    realign_at=10,
     densify_from=15,
     densify_until=60,
     reset_every=20,
@@ -244,8 +243,8 @@ ACTIONS = {
     "shorten: not unless asked to": ("shorten", {}, []),
     "reseed: while densifying, once the deformation has warmed up": ("reseed", RESEED, after(50)),
     "reseed: not unless asked to": ("reseed", OFTEN, []),
-    "realign: once in the pretraining": ("realign", {}, [9]),
-    "realign: at the end of a shorter pretraining": ("realign", {"schedule": {"realign_at": 500}}, [19]),
+    "realign: in the middle of the pretraining": ("realign", {}, [9]),
+    "realign: also in the shortest pretraining": ("realign", {"schedule": {"pretrain": 1}}, [0]),
     "realign: never without pretraining": ("realign", {"dap": False}, []),
 }
 

@@ -8,16 +8,10 @@ from .bounds import Bounds
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the loss terms (paper Eq. 9, 12, 14, 15)."""
+    """Weights of the loss terms (paper Eq. 9, 12, 14, 15), next to those of each image, which are 1."""
 
     ssim: float = 0.2
     """λ_ssim, the weight of 1 − SSIM next to L1 in every image term."""
-    static: float = 1.0
-    """Weight of the static image in the static region (Eq. 9)."""
-    dynamic: float = 1.0
-    """Weight of the dynamic image against the masked ground truth (Eq. 12)."""
-    joint: float = 1.0
-    """Weight of the joint image against the whole ground truth, in stage II and from ``schedule.joint_from`` on."""
     squared: float = 15.0
     """Weight of the squared error of the joint image beside its L1, wherever the joint image is compared; 0 in the
     paper. Large errors vanish sooner and fewer remain."""

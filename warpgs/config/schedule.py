@@ -10,17 +10,15 @@ from .bounds import Bounds
 class Schedule:
     """Everything that is counted in iterations; ``--iterations`` rescales all of it but ``fit_motion`` and ``warmup``.
 
-    Except for the lengths of the stages and ``realign_at``, iterations count from the start of stage I.
+    Except for the lengths of the stages, iterations count from the start of stage I.
     """
 
     pretrain: int = 400
-    """Length of the depth-aware pretraining."""
+    """Length of the depth-aware pretraining; in its middle, monocular depth is aligned again, to the rendered depth."""
     stage1: int = 7_500
     """Length of stage I, in which each branch has its own losses."""
     stage2: int = 37_500
     """Length of stage II, the joint optimization."""
-    realign_at: int = 200
-    """Iteration of the pretraining at which monocular depth is aligned again, to the rendered depth."""
     densify_from: int = 100
     """Iteration from which Gaussians are densified."""
     densify_until: int = 4_500

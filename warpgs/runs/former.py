@@ -23,12 +23,24 @@ class Removed(NamedTuple):
     is_kept: Callable[[Any, dict[str, Any]], bool] = lambda value, section: True
 
 
+def _always(constant: float) -> Removed:
+    return Removed(f"it is always {constant:g}", lambda value, section: value == constant)
+
+
 REMOVED: dict[str, Removed] = {
     "densify.depth_gradients": Removed(),
     "loss.dynamic_background": Removed(),
+    "loss.dynamic": _always(1.0),
+    "loss.joint": _always(1.0),
     "loss.mask_tolerance": Removed(),
+    "loss.static": _always(1.0),
     "schedule.half_size_until": Removed(),
     "schedule.mask_trial": Removed(),
+    "schedule.realign_at": Removed(
+        "depth is aligned again in the middle of the pretraining, schedule.pretrain",
+        # Rescaling rounded both.
+        lambda value, schedule: abs(2 * value - schedule["pretrain"]) <= 2 or schedule["pretrain"] == 0,
+    ),
 }
 """Options that are gone, by name with their section."""
 
@@ -111,7 +123,11 @@ def not_kept(values: dict[str, Any]) -> str | None:
     for name, removed in REMOVED.items():
         *section, field = name.split(".")
         part = values[section[0]] if section else values
-        if field in part and not removed.is_kept(part[field], part):
+        try:
+            is_kept = field not in part or removed.is_kept(part[field], part)
+        except TypeError:
+            is_kept = False
+        if not is_kept:
             return f"{name} is {part[field]}; this version has no such option any more: {removed.advice}"
     return None
 

@@ -82,17 +82,17 @@ TERMS: dict[str, LossTerm] = {
     "static": LossTerm(
         static,
         is_active=lambda phase, config: phase.with_branches,
-        weight=lambda plan, config: config.static,
+        weight=lambda plan, config: 1.0,
     ),
     "dynamic": LossTerm(
         dynamic,
         is_active=lambda phase, config: phase.stage != "pretrain" and phase.with_branches,
-        weight=lambda plan, config: config.dynamic,
+        weight=lambda plan, config: 1.0,
     ),
     "joint": LossTerm(
         joint,
         is_active=lambda phase, config: phase.with_joint,
-        weight=lambda plan, config: config.joint,
+        weight=lambda plan, config: 1.0,
     ),
     "squared": LossTerm(
         squared,

@@ -207,7 +207,7 @@ class Protocol:
         is_grown = schedule.densify_until <= done <= 2 * schedule.densify_until
         is_reset = done % schedule.reset_every == 0 and done < schedule.densify_until
         is_due: dict[Action, bool] = {
-            "realign": stage.name == "pretrain" and iteration + 1 == min(schedule.realign_at, stage.end),
+            "realign": stage.name == "pretrain" and iteration + 1 == (stage.end + 1) // 2,
             "shorten": densify.max_elongation > 0.0 and (is_end_of_interval or is_last),
             "densify": is_growing and is_end_of_interval,
             "prune": self.config.vdp and prunes,
