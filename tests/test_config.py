@@ -35,7 +35,7 @@ def test_presets_are_valid(name):
         ("densify.every", 0),
         ("densify.gradient", -1e-4),
         ("densify.weakest", 1.0),  # would leave no Gaussian
-        ("densify.max_size", 0.0),  # likewise
+        ("densify.split_size", 0.0),  # likewise
         ("model.depth", 0),
         ("model.width", -4),
         ("model.max_static_points", -1),
@@ -76,9 +76,9 @@ def test_networks_without_any_input_of_position_or_time_are_refused(bands):
 
 def test_sizes_in_pixels_are_refused_as_fractions_of_the_extent():
     pixels = DensifyConfig(unit="extent")
-    with pytest.raises(ValueError, match=r"are fractions of the extent, 0.01 and 0.1 in 3DGS, got 2.0 and 20.0"):
+    with pytest.raises(ValueError, match=r"is a fraction of the extent, 0.01 in 3DGS, got 2.0"):
         validate(TrainConfig(densify=pixels))
-    validate(TrainConfig(densify=dataclasses.replace(pixels, split_size=0.01, max_size=0.1)))
+    validate(TrainConfig(densify=dataclasses.replace(pixels, split_size=0.01)))
 
 
 def test_a_schedule_with_only_pretraining_is_refused():

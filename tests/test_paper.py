@@ -13,6 +13,7 @@ from warpgs.config import fields
 from warpgs.config.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.training import optimizer
+from warpgs.training.density import operations
 
 PAPER = {
     "Visual Geometry Decomposition: Eq. 6": {
@@ -68,11 +69,7 @@ PAPER = {
         "optim.means": 1.6e-4,
         "optim.means_scale": 5.0,
         "optim.means_anneal": "trained",
-        "optim.quats": 1e-3,
-        "optim.scales": 5e-3,
-        "optim.opacities": 0.05,
         "optim.sh_dc": 2.5e-3,
-        "optim.sh_rest": 2.5e-3 / 20,
         "schedule.deform_from": 3_000,
         "schedule.noise_until": 20_000,
         "schedule.sh_degree_every": 1_000,
@@ -84,8 +81,6 @@ PAPER = {
         "densify.gradient": 2e-4,
         "densify.unit": "extent",
         "densify.split_size": 0.01,
-        "densify.min_opacity": 0.005,
-        "densify.max_size": 0.1,
         "densify.min_pixels": 0,
         "schedule.densify_from": 600,
         "schedule.densify_until": 14_900,
@@ -157,6 +152,12 @@ def test_adam_has_the_betas_of_the_paper():
     assert optimizer.BETAS == (0.9, 0.999)
 
 
+def test_the_rates_that_are_no_options_are_those_of_deformable_3dgs():
+    rates = {"quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 0.05, "sh_rest": 2.5e-3 / 20}
+    assert rates == pytest.approx(optimizer.FIXED_RATES)
+    assert operations.MIN_OPACITY == 0.005
+
+
 def table():
     """Switch → (value in ``paper``, value in ``best``), from the rows of the tables of docs/method.md."""
     rows = {}
@@ -223,7 +224,7 @@ def test_training_with_the_preset_runs_through_all_stages(tmp_path):
     sizes = ("position_bands", "time_bands", "width", "max_static_points", "dynamic_points")
     model = dataclasses.replace(paper.model, **{name: getattr(tiny.MODEL, name) for name in sizes})
     schedule = dataclasses.replace(tiny.SCHEDULE, appearance_from=paper.schedule.appearance_from, warmup=0)
-    densify = dataclasses.replace(paper.densify, every=4, gradient=1e-5, max_gaussians=120, max_size=1.0)
+    densify = dataclasses.replace(paper.densify, every=4, gradient=1e-5, max_gaussians=120, split_size=0.1)
     small = {"device": "cpu", "model": model, "schedule": schedule, "densify": densify}
     config = dataclasses.replace(paper, **small, checkpoint_every=22, keep_checkpoints=100)  # 22: before stage II
     trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run", config)

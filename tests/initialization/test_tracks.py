@@ -20,6 +20,7 @@ from warpgs.initialization.tracks import _divided
 from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.rendering import render
 from warpgs.synthetic.balls import RADIUS, BallsSize, _balls, balls_capture
+from warpgs.training.optimizer import FIXED_RATES
 from warpgs.views.views import Views
 
 SIZE = BallsSize(side=100, num_frames=50, num_val=6, turns=4.0)
@@ -193,11 +194,11 @@ def test_splines_are_refused_where_nothing_is_tracked(tmp_path):
 
 
 @pytest.fixture
-def trainer(data, capture, tmp_path):
+def trainer(data, capture, tmp_path, monkeypatch):
     model = dataclasses.replace(tiny.MODEL, dynamic_points=500)
     schedule = plain.schedule(stage1=20, stage2=10, densify_until=0, reset_every=1_000, prune_every=1_000)
-    optim = plain.optim(opacities=0.3)
-    config = dataclasses.replace(tiny.CONFIG, background="capture", model=model, schedule=schedule, optim=optim)
+    monkeypatch.setitem(FIXED_RATES, "logit_opacities", 0.3)
+    config = dataclasses.replace(tiny.CONFIG, background="capture", model=model, schedule=schedule)
     return tiny.trainer(data, tmp_path / "run", config)
 
 

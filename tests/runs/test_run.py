@@ -260,12 +260,12 @@ def test_a_missing_field_that_every_version_writes_is_refused_by_its_name(run, n
 FIRST = {
     "": "antialias app assume checkpoint_every dap graph keep_checkpoints resident_bytes seed stage2 static_appearance "
     "static_geometry vdp masks model loss optim densify schedule",
-    "densify": "every gradient max_gaussians max_size min_opacity split_size visibility",
+    "densify": "every gradient max_gaussians split_size visibility",
     "loss": "depth depth_dynamic depth_end ssim",
     "masks": "dilate erode holes",
     "model": "appearance_degree appearance_opacity depth dynamic_points half max_static_points position_bands "
     "sh_degree skip time_bands width",
-    "optim": "means networks networks_end opacities quats scales sh_dc sh_rest",
+    "optim": "means networks networks_end sh_dc",
     "schedule": "appearance_from deform_from densify_from densify_until noise_until pretrain prune_every "
     "reset_every sh_degree_every stage1 stage2 warmup",
 }
@@ -284,10 +284,10 @@ def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, 
                 del part[name]
         values["schedule"]["relight_from"] = values["schedule"].pop("appearance_from")
         del values["densify"]["split_size"]
-        values["densify"] |= {"dense_fraction": 0.01, "max_size": 0.1}
+        values["densify"] |= {"dense_fraction": 0.01}
 
     edit(run, reduce)
-    densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01, max_size=0.1)
+    densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01)
     assert read_config(run) == plain.plan(dataclasses.replace(written, data=None, densify=densify))
 
 
@@ -367,13 +367,13 @@ def test_a_config_with_the_old_name_of_a_field_still_opens(run):
 
 def test_sizes_of_a_run_of_version_0_3_stay_fractions_of_the_extent(run):
     def reduce(values):
-        values["densify"] |= {"dense_fraction": 0.02, "max_size": 0.3}
+        values["densify"] |= {"dense_fraction": 0.02, "max_size": 0.2}
         for name in ("unit", "split_size"):
             del values["densify"][name]
 
     edit(run, reduce)
     densify = read_config(run).densify
-    assert (densify.unit, densify.split_size, densify.max_size) == ("extent", 0.02, 0.3)
+    assert (densify.unit, densify.split_size, densify.max_size) == ("extent", 0.02, 0.2)
 
 
 def test_a_misspelt_capture_of_a_run_is_told_the_similar_one(run, tmp_path):

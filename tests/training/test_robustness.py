@@ -121,7 +121,7 @@ def test_a_loss_that_stays_not_finite_is_an_error(data, run, monkeypatch, first,
 
 def test_where_rates_are_far_above_their_defaults_that_error_names_them(data, run):
     trainer = tiny.trainer(data, run)
-    optim = dataclasses.replace(trainer.config.optim, sh_dc=0.3, networks=0.02, quats=0.009)
+    optim = dataclasses.replace(trainer.config.optim, sh_dc=0.3, networks=0.02, means=0.001)
     trainer.rollbacks, trainer.config = MAX_ROLLBACKS, dataclasses.replace(trainer.config, optim=optim)
     message = r"; --optim\.sh-dc is 0\.3, by default 0\.01$"
     with TrainingLogger(None, tiny.LENGTH, 0) as log, pytest.raises(ValueError, match=message):

@@ -20,21 +20,17 @@ class DensifyConfig:
     gradient: float = 3e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
     unit: Literal["pixel", "extent"] = "pixel"
-    """Unit of ``split_size`` and ``max_size``, which are standard deviations: a pixel of the nearest training view that
+    """Unit of ``split_size``, which is a standard deviation: a pixel of the nearest training view that
     has shown the Gaussian since the last densification, at its depth there; or the radius of the cameras' positions, as
     in 3DGS (paper). Gaussians that no view has shown have any size in pixels. With pixel, errors of depth,
     ``loss.scale`` and ``noise`` are in view sizes of the capture (docs/glossary.md), and offsets of the deformation in
     halves of it; else all are in scene units."""
-    split_size: float = 2.0
-    """Size above which a Gaussian is split instead of cloned."""
-    min_opacity: float = 0.005
-    """Opacity below which a Gaussian is removed."""
-    max_size: Annotated[float, Bounds(positive=True)] = 20.0
-    """Size above which a Gaussian is removed once opacities have been reset, and above which ``max_elongation``
-    holds."""
+    split_size: Annotated[float, Bounds(positive=True)] = 2.0
+    """Size above which a Gaussian is split instead of cloned. Above ten times this size, as in 3DGS, Gaussians are
+    removed once opacities have been reset, and ``max_elongation`` holds."""
     max_elongation: float = 10.0
     """After every ``every`` iterations and at the end, the longest axis of static Gaussians is cut to this many times
-    their second longest, or to ``max_size`` if that is longer. 0: never."""
+    their second longest, or to ten times ``split_size`` if that is longer. 0: never."""
     noise: float = 5e5
     """Factor of the noise on positions in strategy mcmc, next to their learning rate and covariance."""
     max_gaussians: int = 3_000_000
@@ -49,3 +45,8 @@ class DensifyConfig:
     weakest: Annotated[float, Bounds(max=0.99)] = 0.01
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""
+
+    @property
+    def max_size(self) -> float:
+        """Size above which a Gaussian is removed, in ``unit``."""
+        return 10.0 * self.split_size

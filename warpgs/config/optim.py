@@ -8,7 +8,7 @@ from .bounds import Bounds
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Learning rates of Adam; those of Deformable-3DGS where the paper names none."""
+    """Learning rates of Adam; those of Deformable-3DGS where the paper names none, as those that are no options."""
 
     means: float = 5e-4
     """Positions, times ``means_scale``; decays exponentially to 1 %."""
@@ -18,16 +18,8 @@ class OptimConfig:
     means_anneal: Literal["run", "trained"] = "run"
     """Iterations over which the rate of positions decays: the whole run, or those in which a branch's positions are
     trained: static ones until stage II (paper, section Static Component), dynamic ones from stage I."""
-    quats: float = 1e-3
-    """Rotations."""
-    scales: float = 5e-3
-    """Logarithms of the scales."""
-    opacities: float = 0.05
-    """Logits of the opacities."""
     sh_dc: float = 2.5e-3
     """Spherical harmonics of degree 0."""
-    sh_rest: float = 1.25e-4
-    """Spherical harmonics of higher degrees."""
     poses: float = 5e-5
     """Initial rate of the corrections of camera poses [rad, and fractions of the view size]; decays exponentially to
     1 %. 0: cameras stay as the capture has them (paper)."""

@@ -139,8 +139,8 @@ def validate(config: TrainConfig) -> None:
     densify = config.densify
     if densify.unit == "extent" and densify.split_size >= 1.0:
         raise ValueError(
-            "with densify.unit extent, densify.split_size and densify.max_size are fractions of the extent, 0.01 and "
-            f"0.1 in 3DGS, got {densify.split_size} and {densify.max_size}"
+            "with densify.unit extent, densify.split_size is a fraction of the extent, 0.01 in 3DGS, "
+            f"got {densify.split_size}"
         )
     names, rgb = get_args(BackgroundName), config.background
     is_rgb = isinstance(rgb, tuple) and len(rgb) == 3 and all(0.0 <= value <= 1.0 for value in rgb)

@@ -60,7 +60,6 @@ PAPER = replace(
         gradient=2e-4,
         unit="extent",
         split_size=0.01,
-        max_size=0.1,
         max_elongation=0.0,
         min_pixels=0,
         reseed=0.0,

@@ -1,6 +1,7 @@
 """Options of earlier versions: their values as today's version writes them, and advice on those that are gone."""
 
 from collections.abc import Callable
+from math import isclose, nan
 from typing import Any, NamedTuple
 
 from warpgs.runtime.devices import choose_device
@@ -29,11 +30,20 @@ def _always(constant: float) -> Removed:
 
 REMOVED: dict[str, Removed] = {
     "densify.depth_gradients": Removed(),
+    "densify.max_size": Removed(
+        "Gaussians are removed above ten times densify.split_size",
+        lambda value, densify: isclose(value, 10.0 * densify.get("split_size", densify.get("dense_fraction", nan))),
+    ),
+    "densify.min_opacity": _always(0.005),
     "loss.dynamic_background": Removed(),
     "loss.dynamic": _always(1.0),
     "loss.joint": _always(1.0),
     "loss.mask_tolerance": Removed(),
     "loss.static": _always(1.0),
+    "optim.opacities": _always(0.05),
+    "optim.quats": _always(1e-3),
+    "optim.scales": _always(5e-3),
+    "optim.sh_rest": _always(1.25e-4),
     "schedule.half_size_until": Removed(),
     "schedule.mask_trial": Removed(),
     "schedule.realign_at": Removed(

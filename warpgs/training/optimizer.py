@@ -29,6 +29,9 @@ EPSILON = 1e-15
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """Names of Adam's moments in the state of a parameter."""
 
+FIXED_RATES = {"quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 0.05, "sh_rest": 1.25e-4}
+"""Learning rates of parameters of Gaussians that no preset changes (3DGS, Deformable-3DGS)."""
+
 MEANS_DECAY = 0.01
 """Final learning rate of positions, relative to the initial one (3DGS)."""
 
@@ -99,13 +102,7 @@ def learning_rates(config: OptimConfig, unit: float, at: RatePlan) -> dict[str, 
         at: Of the iteration.
     """
     scale = unit if config.means_scale is None else config.means_scale
-    gaussians = {
-        "quats": config.quats,
-        "log_scales": config.scales,
-        "logit_opacities": config.opacities,
-        "sh_dc": config.sh_dc,
-        "sh_rest": config.sh_rest,
-    }
+    gaussians = {**FIXED_RATES, "sh_dc": config.sh_dc}
     settled = exponential(1.0, SETTLE_DECAY, at.settle_progress)
     rates = {f"{branch}.{name}": settled * rate for branch in BRANCHES for name, rate in gaussians.items()}
     for branch in BRANCHES:

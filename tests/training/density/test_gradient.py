@@ -16,7 +16,7 @@ from warpgs.training.density.gradient import GradientStrategy, Limits, densify
 from warpgs.training.logger import TrainingLogger
 
 UNIT = 2.0
-CONFIG = plain.densify(gradient=0.5, split_size=0.05, min_opacity=0.1, max_size=0.5)
+CONFIG = plain.densify(gradient=0.5, split_size=0.05)
 SMALL, LARGE = 0.09, 0.11  # around UNIT · split_size = 0.1
 HUGE, OVERSIZED = 0.9, 1.1  # around UNIT · max_size = 1
 SMALL_GRADIENT, LARGE_GRADIENT = 0.4, 0.6  # around the threshold
@@ -52,14 +52,14 @@ def chosen(tensors, index):
 
 ALL_SMALL = [SMALL_GRADIENT] * 3
 SECOND_LARGE = [SMALL_GRADIENT, LARGE_GRADIENT, SMALL_GRADIENT]
-THIRD_FAINT = {"opacities": [0.8, 0.8, 0.01]}
+THIRD_FAINT = {"opacities": [0.8, 0.8, 0.001]}
 # Sizes, gradients and options of a densification that splits none, and the index of the Gaussians after it.
 CHOICES = {
     "small gradients change nothing": ([SMALL, LARGE, SMALL], [0.0, SMALL_GRADIENT, CONFIG.gradient], {}, [0, 1, 2]),
     "nor does a large one at the threshold": ([LARGE], [CONFIG.gradient], {}, [0]),
     "a small one with a large gradient is cloned": ([SMALL, SMALL, LARGE], SECOND_LARGE, {}, [0, 1, 2, 1]),
-    "transparent ones are removed": ([SMALL, LARGE, SMALL], ALL_SMALL, {"opacities": [0.09, 0.11, 0.01]}, [1]),
-    "so are those with large gradients": ([SMALL, LARGE], [LARGE_GRADIENT] * 2, {"opacities": 0.09}, []),
+    "transparent ones are removed": ([SMALL, LARGE, SMALL], ALL_SMALL, {"opacities": [0.0049, 0.0051, 0.001]}, [1]),
+    "so are those with large gradients": ([SMALL, LARGE], [LARGE_GRADIENT] * 2, {"opacities": 0.0049}, []),
     "oversized ones are removed if requested": ([OVERSIZED, SMALL, HUGE], ALL_SMALL, {"remove_large": True}, [1, 2]),
     "oversized ones are otherwise kept": ([OVERSIZED, SMALL, HUGE], ALL_SMALL, {}, [0, 1, 2]),
     "infinite ones are removed": ([SMALL, math.inf, LARGE], SECOND_LARGE, {}, [0, 2]),

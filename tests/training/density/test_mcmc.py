@@ -13,6 +13,7 @@ from tests.training.density.sets import copies, equal, make_gaussians, trained
 from warpgs.runtime import ranks
 from warpgs.runtime.random_numbers import random_numbers
 from warpgs.training.density.mcmc import add_noise
+from warpgs.training.density.operations import MIN_OPACITY
 from warpgs.training.logger import TrainingLogger
 
 LOSS = dataclasses.replace(tiny.CONFIG.loss, opacity=0.01, scale=0.01)
@@ -71,7 +72,7 @@ def test_transparent_and_infinite_gaussians_are_relocated(data, tmp_path):
     trainer._adapt(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
     assert len(static) == num
     assert static.means.isfinite().all()
-    assert static.opacities.min() >= DENSIFY.min_opacity * (1 - 1e-5)
+    assert static.opacities.min() >= MIN_OPACITY * (1 - 1e-5)
 
 
 def test_opacities_are_not_reset(data, tmp_path):

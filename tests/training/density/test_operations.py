@@ -115,9 +115,7 @@ def test_the_size_of_any_shape_is_that_of_each_gaussian():
 
 @pytest.mark.parametrize("unit", ["extent", "pixel"])
 def test_static_needles_alone_are_shortened_in_the_unit_of_densification(data, tmp_path, unit):
-    densify_config = dataclasses.replace(
-        tiny.CONFIG.densify, max_elongation=10.0, max_size=0.5, split_size=0.01, unit=unit
-    )
+    densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, split_size=0.05, unit=unit)
     trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config))
     needles, extent = make_gaussians([SIZE]), trainer.capture.extent
     needles.log_scales.data = torch.tensor([[0.001, 9.0, 0.001]]).log()
@@ -132,7 +130,7 @@ def test_static_needles_alone_are_shortened_in_the_unit_of_densification(data, t
 
 @pytest.mark.parametrize("static_geometry", [True, False])
 def test_training_with_a_limit_ends_without_static_needles(data, tmp_path, static_geometry):
-    limit = dataclasses.replace(tiny.CONFIG.densify, max_elongation=1.05, max_size=1e-6)
+    limit = dataclasses.replace(tiny.CONFIG.densify, max_elongation=1.05, split_size=1e-7)
     schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=100)  # until then nothing is removed as too large
     config = dataclasses.replace(tiny.CONFIG, static_geometry=static_geometry, schedule=schedule)
     elongations = []

@@ -14,7 +14,7 @@ from warpgs.model.splats import Splats
 from warpgs.ops.adam import Adam
 
 from .adaptation import Adaptation
-from .operations import SPLIT_SHRINK, clone, remove, split
+from .operations import MIN_OPACITY, SPLIT_SHRINK, clone, remove, split
 from .strategy import Strategy
 
 
@@ -53,7 +53,7 @@ def densify(
         generator: CPU generator that samples the positions of the children of splits.
     """
     sizes = gaussians.scales.max(1).values
-    alive = (gaussians.opacities >= config.min_opacity) & sizes.isfinite() & gaussians.means.isfinite().all(1)
+    alive = (gaussians.opacities >= MIN_OPACITY) & sizes.isfinite() & gaussians.means.isfinite().all(1)
     max_size = (config.max_size if limits.remove_large else math.inf) * limits.units
     is_large = sizes > config.split_size * limits.units
     # As in 3DGS, growth comes first: the children of an oversized Gaussian stay if they are small enough themselves.

@@ -16,7 +16,7 @@ from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 
 from .adaptation import Adaptation
-from .operations import rotated
+from .operations import MIN_OPACITY, rotated
 from .relocation import respawn
 from .strategy import Strategy
 
@@ -51,13 +51,13 @@ class McmcStrategy(Strategy):
 
     def densify(self, at: Adaptation) -> None:
         """In both branches, which divide the remaining capacity in proportion to their numbers."""
-        config, branches = at.config.densify, (at.scene.static, at.scene.dynamic)
+        branches = (at.scene.static, at.scene.dynamic)
         generator, capacity, num = at.generator("densify"), max(0, at.capacity), sum(map(len, branches))
         for gaussians in branches:
             is_finite = gaussians.log_scales.isfinite().all(1) & gaussians.means.isfinite().all(1)
-            is_dead = ~((gaussians.opacities > config.min_opacity) & is_finite)
+            is_dead = ~((gaussians.opacities > MIN_OPACITY) & is_finite)
             added = min(int(GROWTH * len(gaussians)), capacity * len(gaussians) // max(1, num))
-            respawn(gaussians, at.optimizer, is_dead, added, config.min_opacity, generator)
+            respawn(gaussians, at.optimizer, is_dead, added, MIN_OPACITY, generator)
 
     def after_step(
         self, scene: SplitScene, optimizer: Adam, unit: float, generator: Callable[[str, torch.device], torch.Generator]
