@@ -27,7 +27,7 @@ UNUSUAL = dataclasses.replace(
     dataset="iphone",
     factor=3,
     seed=5,
-    dap=False,
+    omit=("dap", "app"),
     assume="dynamic",
     masks=MaskPerturbation(erode=2, holes=0.25),
     lpips=Path("/weights"),
@@ -140,7 +140,8 @@ def test_a_folder_that_another_training_has_filled_before_it_is_locked_is_refuse
 @pytest.mark.parametrize("is_old", [False, True])
 def test_earlier_runs_without_pretraining_stay_without_a_depth_loss(run, dap, is_old):
     def change(values):
-        values["dap"] = dap
+        del values["omit"]
+        values |= {"dap": dap, "vdp": True, "app": True, "stage2": True}
         if is_old:
             del values["loss"]["depth_gate"]
 
@@ -150,6 +151,16 @@ def test_earlier_runs_without_pretraining_stay_without_a_depth_loss(run, dap, is
     config = read_config(run)
     assert config.loss.depth == (0 if is_old and not dap else depth)
     assert Protocol(config, has_depth=True).phase_at(0).with_depth == (config.loss.depth > 0)
+
+
+@pytest.mark.parametrize("omitted", [(), ("vdp",), ("dap", "app", "stage2")])
+def test_components_had_a_switch_each(run, omitted):
+    def change(values):
+        del values["omit"]
+        values |= {name: name not in omitted for name in former.COMPONENTS}
+
+    edit(run, change)
+    assert read_config(run).omit == omitted
 
 
 def test_runs_of_a_preset_that_is_gone_keep_their_options(run):
@@ -219,7 +230,13 @@ def test_an_unknown_field_is_refused_by_its_name(run, part):
         read_config(run)
 
 
-WRONG = {"seed": ["0", 1.5, True, None], "dap": [1], "assume": ["nothing"], "device": ["tpu"]}
+WRONG = {
+    "seed": ["0", 1.5, True, None],
+    "antialias": [1],
+    "omit": ["dap", ["all"], [1]],
+    "assume": ["nothing"],
+    "device": ["tpu"],
+}
 WRONG |= {"factor": ["2"], "data": [5, ["a"]], "lpips": [{}]}
 
 
@@ -249,7 +266,7 @@ def test_a_missing_section_is_refused_by_its_name(run, section):
         read_config(run)
 
 
-@pytest.mark.parametrize("name", ["seed", "dap", "schedule.stage1", "optim.means", "model.width", "loss.ssim"])
+@pytest.mark.parametrize("name", ["seed", "omit", "schedule.stage1", "optim.means", "model.width", "loss.ssim"])
 def test_a_missing_field_that_every_version_writes_is_refused_by_its_name(run, name):
     *sections, field = name.split(".")
     edit(run, lambda values: (values[sections[0]] if sections else values).pop(field))
@@ -258,8 +275,8 @@ def test_a_missing_field_that_every_version_writes_is_refused_by_its_name(run, n
 
 
 FIRST = {
-    "": "antialias app assume checkpoint_every dap graph keep_checkpoints resident_bytes seed stage2 static_appearance "
-    "static_geometry vdp masks model loss optim densify schedule",
+    "": "antialias assume checkpoint_every graph keep_checkpoints resident_bytes seed static_appearance "
+    "static_geometry masks model loss optim densify schedule",
     "densify": "every gradient max_gaussians split_size visibility",
     "loss": "depth depth_dynamic depth_end ssim",
     "masks": "dilate erode holes",
@@ -274,7 +291,7 @@ FIRST = {
 
 def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, capture):
     """None of the remedies of later versions, whatever the defaults are."""
-    written = plain.config(app=False, out=tmp_path / "run", data=tmp_path)
+    written = plain.config(omit=("app",), out=tmp_path / "run", data=tmp_path)
     run = create(written, capture)
 
     def reduce(values):
@@ -285,6 +302,7 @@ def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, 
         values["schedule"]["relight_from"] = values["schedule"].pop("appearance_from")
         del values["densify"]["split_size"]
         values["densify"] |= {"dense_fraction": 0.01}
+        values |= {"dap": True, "vdp": True, "app": False, "stage2": True}
 
     edit(run, reduce)
     densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01)

@@ -109,7 +109,7 @@ def test_two_cells_with_one_name_are_refused(tmp_path):
 
 
 def test_variants_are_equal_if_they_train_the_same_on_one_capture_whatever_its_names(tmp_path):
-    different = (Variant("a", "", {}), Variant("b", "", {"app": False}))
+    different = (Variant("a", "", {}), Variant("b", "", {"omit": ["app"]}))
     scenes = {"first": "/as", "second": "/as"}
     assert equal_variants(plan(spec(*different), scenes, tmp_path)) == []
     assert equal_variants(plan(spec(*different, Variant("c", "", {})), scenes, tmp_path)) == [["a", "c"]]
@@ -245,7 +245,7 @@ def test_a_folder_that_may_not_be_read_stands_for_itself_and_is_skipped_in_other
 
 def test_the_captures_of_cells_are_what_their_commands_train_on_each_once(tmp_path):
     captures = {"my cup": str(tmp_path / "my cup"), "room": "builtin:room", "as": str(tmp_path / "as")}
-    cells = plan(spec(Variant("data", "", {}), Variant("b", "", {"app": False}), seeds=(0, 1)), captures, tmp_path)
+    cells = plan(spec(Variant("data", "", {}), Variant("b", "", {"omit": ["app"]}), seeds=(0, 1)), captures, tmp_path)
     assert trained_captures([*(cell.command for cell in cells), "warpgs train --preset quick"]) == [*captures.values()]
 
 

@@ -22,7 +22,7 @@ seeds = 2
 options.iterations = 32
 [variants.full]
 [variants.plain]
-app = false
+omit = ["app"]
 """
 
 
@@ -292,7 +292,7 @@ def test_a_dry_run_trains_nothing(sweep, tmp_path, capsys):
 
 
 def test_variants_that_train_the_same_are_named(sweep, tmp_path, capsys):
-    (tmp_path / "mine.toml").write_text(f"{TOML}[variants.again]\napp = false\n")
+    (tmp_path / "mine.toml").write_text(f"{TOML}[variants.again]\nomit = ['app']\n")
     assert sweep("--dry-run")[0] == 0
     assert capsys.readouterr().err == "warning: variants with the same options, which train the same: plain, again\n"
 

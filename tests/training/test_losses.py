@@ -426,11 +426,11 @@ def test_in_stage_2_the_joint_term_trains_dynamic_gaussians_and_both_networks(mo
         ({}, set()),
         ({"static_geometry": True}, GEOMETRY),
         ({"static_appearance": True}, EARLY_APPEARANCE | {"sh_rest"}),
-        ({"app": False}, EARLY_APPEARANCE | {"sh_rest"}),
+        ({"omit": ("app",)}, EARLY_APPEARANCE | {"sh_rest"}),
     ],
     ids=["nothing", "geometry", "appearance", "appearance without its network"],
 )
 def test_stage_2_trains_of_static_gaussians_only_what_the_config_lets_it(options, trained):
     changed = changed_by("stage2", **options)
     assert of("static", changed) == trained
-    assert ("appearance" in changed) == options.get("app", True)
+    assert ("appearance" in changed) == ("omit" not in options)

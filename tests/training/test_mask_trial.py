@@ -23,7 +23,7 @@ from warpgs.training.train import train
 LENGTH = 60
 pytestmark = pytest.mark.usefixtures("quickly")
 
-CONFIG = dataclasses.replace(tiny.CONFIG, preset="best", app=False, try_masks=True, background="black")
+CONFIG = dataclasses.replace(tiny.CONFIG, preset="best", omit=("app",), try_masks=True, background="black")
 
 
 @pytest.fixture(autouse=True)
@@ -184,7 +184,7 @@ def test_held_out_frames_are_not_trained_on(folder, monkeypatch):
     assert val == (capture.train[4], capture.train[12])
     assert sorted((*train, *val)) == sorted(capture.train)
     assert (config.schedule.num_iterations, config.iterations, config.assume) == (LENGTH, None, "dynamic")
-    assert not config.app  # a switch of the run
+    assert config.omit == ("app",)  # a switch of the run
     assert not config.exposure  # held-out frames are compared as they are
     assert not run.exists()
 

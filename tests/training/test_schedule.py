@@ -86,20 +86,20 @@ WITHOUT_PRETRAINING = [("stage1", 0, 119), ("stage2", 120, 199)]
 
 
 @pytest.mark.parametrize(
-    ("off", "stages"),
+    ("changes", "stages"),
     [
-        (["vdp"], WHOLE),
-        (["app"], WHOLE),
-        (["has_depth"], WITHOUT_PRETRAINING),
-        (["dap"], WITHOUT_PRETRAINING),
-        (["has_depth", "dap"], WITHOUT_PRETRAINING),
-        (["stage2"], [("pretrain", 0, 19), ("stage1", 20, 199)]),
-        (["dap", "stage2"], [("stage1", 0, 199)]),
+        ({"omit": ("vdp",)}, WHOLE),
+        ({"omit": ("app",)}, WHOLE),
+        ({"has_depth": False}, WITHOUT_PRETRAINING),
+        ({"omit": ("dap",)}, WITHOUT_PRETRAINING),
+        ({"has_depth": False, "omit": ("dap",)}, WITHOUT_PRETRAINING),
+        ({"omit": ("stage2",)}, [("pretrain", 0, 19), ("stage1", 20, 199)]),
+        ({"omit": ("dap", "stage2")}, [("stage1", 0, 199)]),
     ],
     ids=str,
 )
-def test_stage_1_takes_the_iterations_of_stages_that_are_switched_off(off, stages):
-    made = protocol(**dict.fromkeys(off, False))
+def test_stage_1_takes_the_iterations_of_stages_that_are_switched_off(changes, stages):
+    made = protocol(**changes)
     assert boundaries(made) == stages
     assert made.num_iterations == END
 
@@ -123,9 +123,9 @@ def iterations_with_joint_term(**changes):
     return [i for i, plan in enumerate(plans(**changes)) if is_active(plan.phase, CONFIG.loss)]
 
 
-@pytest.mark.parametrize("app", [True, False])
-def test_the_joint_term_is_active_in_stage_2_only(app):
-    assert iterations_with_joint_term(app=app) == list(range(STAGE2, END))
+@pytest.mark.parametrize("omit", [(), ("app",)])
+def test_the_joint_term_is_active_in_stage_2_only(omit):
+    assert iterations_with_joint_term(omit=omit) == list(range(STAGE2, END))
 
 
 BRANCH_TERMS = {"static", "dynamic", "depth", "depth_dynamic"}
@@ -143,7 +143,7 @@ def test_in_stage_2_the_terms_of_single_branches_can_end(keeps):
 
 
 def test_without_stage_2_there_is_no_joint_term():
-    assert iterations_with_joint_term(stage2=False) == []
+    assert iterations_with_joint_term(omit=("stage2",)) == []
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -198,14 +198,14 @@ def last(first):
 
 FLAGS = {
     "appearance: from its iteration of stage 1 on": ("use_appearance", {}, last(STAGE1 + 35)),
-    "appearance: likewise without stage 2": ("use_appearance", {"stage2": False}, last(STAGE1 + 35)),
+    "appearance: likewise without stage 2": ("use_appearance", {"omit": ("stage2",)}, last(STAGE1 + 35)),
     "appearance: at the latest from stage 2 on": ("use_appearance", LATE, last(STAGE2)),
     "appearance: can wait for stage 2": ("use_appearance", WAITING, last(STAGE2)),
     "appearance: can wait for stage 2 without depth": ("use_appearance", {"has_depth": False, **WAITING}, last(STAGE2)),
-    "appearance: never without the stage 2 it waits for": ("use_appearance", {"stage2": False, **WAITING}, []),
-    "appearance: never if it is switched off": ("use_appearance", {"app": False}, []),
+    "appearance: never without the stage 2 it waits for": ("use_appearance", {"omit": ("stage2",), **WAITING}, []),
+    "appearance: never if it is switched off": ("use_appearance", {"omit": ("app",)}, []),
     "deformation: from its iteration of stage 1 on": ("use_deformation", {}, last(STAGE1 + 25)),
-    "deformation: likewise without stage 2": ("use_deformation", {"stage2": False}, last(STAGE1 + 25)),
+    "deformation: likewise without stage 2": ("use_deformation", {"omit": ("stage2",)}, last(STAGE1 + 25)),
     "deformation: at the latest from stage 2 on": ("use_deformation", LATE, last(STAGE2)),
     "dropout: from stage 1 on": ("use_dropout", DROPPING, last(STAGE1)),
     "dropout: until Gaussians settle": ("use_dropout", {**DROPPING, **SETTLING}, list(range(STAGE1, END - 30))),
@@ -213,12 +213,12 @@ FLAGS = {
     "densification: until its last iteration": ("densifies", {}, list(range(STAGE1 + 60))),
     "densification: never in stage 2": ("densifies", {"schedule": {"densify_until": 1000}}, list(range(STAGE2))),
     "settling: not unless asked to": ("settle_progress", {"schedule": {"settle": 0}}, []),
-    "depth weight: without pretraining, too": ("depth_weight", {"dap": False}, last(0)),
+    "depth weight: without pretraining, too": ("depth_weight", {"omit": ("dap",)}, last(0)),
     "depth weight: none without depth": ("depth_weight", {"has_depth": False}, []),
-    "depth weight: none without depth and pretraining": ("depth_weight", {"has_depth": False, "dap": False}, []),
+    "depth weight: none without depth and pretraining": ("depth_weight", {"has_depth": False, "omit": ("dap",)}, []),
     "depth weight: none if it is zero": ("depth_weight", NO_DEPTH, []),
     "depth: not rendered if there is none": ("with_depth", {"has_depth": False}, []),
-    "depth: not rendered without depth and pretraining": ("with_depth", {"has_depth": False, "dap": False}, []),
+    "depth: not rendered without depth and pretraining": ("with_depth", {"has_depth": False, "omit": ("dap",)}, []),
     "depth: not rendered if its weight is zero": ("with_depth", NO_DEPTH, []),
 }
 
@@ -233,11 +233,15 @@ ACTIONS = {
     "densify: never in stage 2": ("densify", {"schedule": {"densify_until": 1000}}, after(*range(20, 101, 10))),
     "reset: at intervals before the last densification": ("reset", {}, after(20, 40)),
     "prune: at intervals and at the end of stage 1": ("prune", {}, after(30, 60, 90, 100)),
-    "prune: never if it is switched off": ("prune", {"vdp": False}, []),
-    "prune: without stage 2 not after the last iteration": ("prune", {"stage2": False}, after(30, 60, 90, 120, 150)),
+    "prune: never if it is switched off": ("prune", {"omit": ("vdp",)}, []),
+    "prune: without stage 2 not after the last iteration": (
+        "prune",
+        {"omit": ("stage2",)},
+        after(30, 60, 90, 120, 150),
+    ),
     "weakest: once densification has ended": ("prune_weakest", WEAKEST, after(60, 90, 100)),
-    "weakest: also without pruning by visibility": ("prune_weakest", {**WEAKEST, "vdp": False}, after(60, 90, 100)),
-    "weakest: without stage 2, too": ("prune_weakest", {**WEAKEST, "stage2": False}, after(60, 90, 120)),
+    "weakest: also without pruning by visibility": ("prune_weakest", {**WEAKEST, "omit": ("vdp",)}, after(60, 90, 100)),
+    "weakest: without stage 2, too": ("prune_weakest", {**WEAKEST, "omit": ("stage2",)}, after(60, 90, 120)),
     "weakest: not unless asked to": ("prune_weakest", {}, []),
     "shorten: at intervals and at the end": ("shorten", NEEDLES, [STAGE1 - 1, *after(50, 100, 150), END - 1]),
     "shorten: not unless asked to": ("shorten", {}, []),
@@ -245,7 +249,7 @@ ACTIONS = {
     "reseed: not unless asked to": ("reseed", OFTEN, []),
     "realign: in the middle of the pretraining": ("realign", {}, [9]),
     "realign: also in the shortest pretraining": ("realign", {"schedule": {"pretrain": 1}}, [0]),
-    "realign: never without pretraining": ("realign", {"dap": False}, []),
+    "realign: never without pretraining": ("realign", {"omit": ("dap",)}, []),
 }
 
 
@@ -303,7 +307,7 @@ COURSES = {
     "progress rises linearly from zero to one": ("progress", {}, rising_from(0)),
     "that of static positions can end before stage 2": ("means_progress.static", TRAINED, UNTIL_STAGE2),
     "but not if stage 2 trains them": ("means_progress.static", {"static_geometry": True, **TRAINED}, rising_from(0)),
-    "nor if there is no stage 2": ("means_progress.static", {"stage2": False, **TRAINED}, rising_from(0)),
+    "nor if there is no stage 2": ("means_progress.static", {"omit": ("stage2",), **TRAINED}, rising_from(0)),
     "that of dynamic positions can begin in stage 1": ("means_progress.dynamic", TRAINED, rising_from(STAGE1)),
     "that of a deformation begins with it": ("network_progress.deformation", {}, rising_from(STAGE1 + 25)),
     "that of an appearance begins with it": ("network_progress.appearance", {}, rising_from(STAGE1 + 35)),

@@ -17,6 +17,9 @@ from .schedule import Schedule
 NetName = Literal["vgg", "alex", "squeeze"]
 """Networks of LPIPS."""
 
+Component = Literal["dap", "vdp", "app", "stage2"]
+"""Components of the paper, by their names in its Table 4."""
+
 BackgroundName = Literal["capture", "mean", "black", "white"]
 """Backgrounds that have a name."""
 
@@ -56,14 +59,10 @@ class TrainConfig:
     depth: bool = True
     """Use the capture's depth; without it there is no pretraining, no depth loss, and no depth to start from: points
     that are unprojected from depth are not read either."""
-    dap: bool = True
-    """Depth-aware pretraining; without it, its iterations are added to stage I, and depth is still compared there."""
-    vdp: bool = True
-    """Visibility-driven pruning."""
-    app: bool = True
-    """Appearance network of the static Gaussians, from ``schedule.appearance_from`` on."""
-    stage2: bool = True
-    """Joint optimization; without it, its iterations are added to stage I."""
+    omit: tuple[Component, ...] = ()
+    """Components of the paper to omit (Table 4): depth-aware pretraining (dap; depth is still compared),
+    visibility-driven pruning (vdp), the appearance network of static Gaussians (app), stage II. Iterations of dap and
+    stage2 go to stage I."""
     assume: Literal["masks", "static", "dynamic"] = "masks"
     """What moves: what the masks mark, nothing (static), or everything (dynamic)."""
     try_masks: bool = True

@@ -14,7 +14,7 @@ from warpgs.config.builtin import is_builtin
 from warpgs.errors import missing, suggestion
 from warpgs.files import read_json, write_text
 
-from .former import FORMER, RENAMED, as_today, not_kept
+from .former import FORMER, RENAMED, as_today, former_option, not_kept
 
 NAME, START = "config.json", "start.json"
 MAX_BYTES = 1 << 20
@@ -127,7 +127,8 @@ def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
     values = {RENAMED.get(name, name): value for name, value in values.items()}
     hints = typing.get_type_hints(cls)
     if unknown := sorted(set(values) - set(hints)):
-        close = suggestion(unknown[0], set(hints) - set(values))
+        name = f"{prefix}{unknown[0]}"
+        close = former_option(name) or suggestion(unknown[0], set(hints) - set(values))
         raise ValueError(f"{path} has fields of another version: {', '.join(unknown):.200}{close}")
     values = FORMER.get(prefix.rstrip("."), {}) | values
     if lacking := [name for name in hints if name not in values]:
@@ -146,7 +147,7 @@ def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
         elif not _matches(value, hint):
             raise ValueError(f"{path}: {prefix}{name} cannot be {reprlib.repr(value)}")
         if isinstance(value, list):
-            value = tuple(float(item) for item in value)
+            value = tuple(item if isinstance(item, str) else float(item) for item in value)
         fields[name] = float(value) if hint is float else value
     return cls(**fields)
 
@@ -156,7 +157,11 @@ def _matches(value: Any, hint: Any) -> bool:
         return value in typing.get_args(hint)
     if typing.get_origin(hint) is tuple:
         items = typing.get_args(hint)
-        return isinstance(value, list) and len(value) == len(items) and all(map(_matches, value, items))
+        if not isinstance(value, list | tuple):
+            return False
+        if items[1:] == (...,):
+            items = (items[0],) * len(value)
+        return len(value) == len(items) and all(map(_matches, value, items))
     if choices := typing.get_args(hint):
         return any(_matches(value, choice) for choice in choices)
     if hint is float:

@@ -28,7 +28,11 @@ def _always(constant: float) -> Removed:
     return Removed(f"it is always {constant:g}", lambda value, section: value == constant)
 
 
+COMPONENTS = ("dap", "vdp", "app", "stage2")
+"""Components of the paper, each of which had a switch."""
+
 REMOVED: dict[str, Removed] = {
+    **{name: Removed(f"--omit {name} omits it") for name in COMPONENTS},
     "densify.depth_gradients": Removed(),
     "densify.max_size": Removed(
         "Gaussians are removed above ten times densify.split_size",
@@ -163,6 +167,8 @@ def as_today(values: dict[str, Any]) -> dict[str, Any]:
         values.setdefault("branches_in_stage2", loss.get("branches_in_stage2") != "no")
         if values.get("dap") is False and "depth_gate" not in loss:
             loss["depth"] = 0.0
+    if all(isinstance(values.get(name), bool) for name in COMPONENTS):
+        values.setdefault("omit", [name for name in COMPONENTS if not values[name]])
     for name in REMOVED:
         *section, field = name.split(".")
         part = values.get(section[0]) if section else values

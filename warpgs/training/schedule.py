@@ -134,9 +134,9 @@ class Protocol:
         self.config = config if fits_motion else replace(config, schedule=replace(config.schedule, fit_motion=0))
         self.has_depth, self.fits_motion = has_depth, fits_motion
         schedule = config.schedule
-        pretrain = schedule.pretrain if config.dap and has_depth and pretrains else 0
+        pretrain = schedule.pretrain if "dap" not in config.omit and has_depth and pretrains else 0
         # A component that is disabled gives its iterations to stage I, so that runs have equal budgets.
-        stage2 = schedule.stage2 if config.stage2 else 0
+        stage2 = schedule.stage2 if "stage2" not in config.omit else 0
         stage1 = schedule.num_iterations - pretrain - stage2
         self.pretrain = Stage("pretrain", 0, pretrain)
         self.stage1 = Stage("stage1", pretrain, pretrain + stage1)
@@ -157,7 +157,7 @@ class Protocol:
         """
         left = max(0, self.num_iterations - iteration)
         first = self.stage1.start + self._network_starts["appearance"]
-        return left + (min(left, self.num_iterations - first) if self.config.app else 0)
+        return left + (min(left, self.num_iterations - first) if "app" not in self.config.omit else 0)
 
     def stage_at(self, iteration: int) -> Stage:
         """The stage that an iteration belongs to."""
@@ -171,7 +171,7 @@ class Protocol:
         return Phase(
             stage=stage,
             use_deformation=in_stage1 >= self._network_starts["deformation"],
-            use_appearance=config.app and in_stage1 >= self._network_starts["appearance"],
+            use_appearance="app" not in config.omit and in_stage1 >= self._network_starts["appearance"],
             sh_degree=min(config.model.sh_degree, max(0, in_stage1) // config.schedule.sh_degree_every),
             with_depth=self.has_depth and config.loss.depth > 0.0 and with_branches,
             with_branches=with_branches,
@@ -210,7 +210,7 @@ class Protocol:
             "realign": stage.name == "pretrain" and iteration + 1 == (stage.end + 1) // 2,
             "shorten": densify.max_elongation > 0.0 and (is_end_of_interval or is_last),
             "densify": is_growing and is_end_of_interval,
-            "prune": self.config.vdp and prunes,
+            "prune": "vdp" not in self.config.omit and prunes,
             "reseed": densify.reseed > 0.0 and prunes and self._reseed_from < done < schedule.densify_until,
             "prune_weakest": densify.weakest > 0.0 and prunes and is_grown,
             "reset": is_growing and is_reset,

@@ -18,7 +18,7 @@ from warpgs.training.logger import TrainingLogger
 
 LOSS = dataclasses.replace(tiny.CONFIG.loss, opacity=0.01, scale=0.01)
 DENSIFY = dataclasses.replace(tiny.CONFIG.densify, strategy="mcmc", weakest=0.0)
-CONFIG = dataclasses.replace(tiny.CONFIG, loss=LOSS, densify=DENSIFY, vdp=False)
+CONFIG = dataclasses.replace(tiny.CONFIG, loss=LOSS, densify=DENSIFY, omit=("vdp",))
 
 
 def noisy(gaussians, normal, factor=2.0):
