@@ -22,6 +22,11 @@ MAX_ANGLE = 30.0
 evidence [degrees]."""
 
 
+def intrinsic_matrix(focal: tuple[float, float], center: tuple[float, float]) -> Float[np.ndarray, "3 3"]:
+    """K of (x, y) focal lengths and a principal point [px from the image's corner], without skew."""
+    return np.array([[focal[0], 0.0, center[0]], [0.0, focal[1], center[1]], [0.0, 0.0, 1.0]])
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera at one time.
@@ -154,7 +159,7 @@ class Camera:
         viewmat = torch.eye(4, dtype=torch.float32, device=device)
         viewmat[:3, :3] = rotation
         viewmat[:3, 3] = -rotation @ position
-        K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+        K = intrinsic_matrix((focal, focal), (width / 2, height / 2))
         return Camera(viewmat, torch.tensor(K, dtype=torch.float32, device=device), width, height, time)
 
 

@@ -70,6 +70,10 @@ def test_the_image_of_a_pinhole_is_unchanged():
     assert pinhole_matrix(PINHOLE).tolist() == [[140, 0, 83], [0, 150, 57], [0, 0, 1]]
 
 
+def test_the_lens_of_intrinsics_has_these_intrinsics():
+    assert Lens.pinhole(pinhole_matrix(PINHOLE), (PINHOLE.width, PINHOLE.height)) == PINHOLE
+
+
 def test_masks_and_depth_get_no_new_values():
     mask = image_of_pinhole(PINHOLE, lambda x, y: x + y > 0.1)
     depth = np.where(mask, np.float32(np.nan), np.float32(2.0))

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from warpgs.cameras import Camera
+from warpgs.cameras import Camera, intrinsic_matrix
 from warpgs.model.gaussians import SH_C0
 from warpgs.model.splats import Splats
 from warpgs.ops.sh import num_bases
@@ -95,7 +95,7 @@ def random_splats(N: int, width: int, height: int, pixels: float, seed: int) -> 
     )
     opacities = torch.sigmoid(torch.randn(N, dtype=torch.float32, generator=generator) * 1.5)
     colors = torch.rand(N, 3, dtype=torch.float32, generator=generator)
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], dtype=torch.float32)
+    K = torch.tensor(intrinsic_matrix((focal, focal), (width / 2, height / 2)), dtype=torch.float32)
     return Splats(means, quats, scales, opacities, colors), Camera(torch.eye(4, dtype=torch.float32), K, width, height)
 
 

@@ -111,8 +111,7 @@ def _write_frames(folder: Path, capture: Capture, names: Sequence[str], quiet: b
 
 
 def _write_view(folder: Path, frame: Frame) -> None:
-    (fx, _, cx), (_, fy, cy), _ = frame.camera.K.double().tolist()
-    lens = Lens(frame.camera.width, frame.camera.height, (fx, fy), (cx, cy))
+    lens = Lens.pinhole(frame.camera.K, frame.camera.size)
     rotation, position = frame.camera.viewmat[:3, :3].double(), frame.camera.position.double()
     writer.write_image(folder, frame.name, frame.image.numpy(), FACTORS)
     writer.write_camera(folder, frame.name, lens, rotation.numpy(), position.numpy())

@@ -23,7 +23,9 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
+from torch import Tensor
 
+from warpgs.cameras import intrinsic_matrix
 from warpgs.files import MAX_NUMBER
 
 from .images import MAX_PIXELS, MAX_SIDE
@@ -75,6 +77,12 @@ class Lens:
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)
     fisheye: tuple[float, float, float, float] | None = None
+
+    @staticmethod
+    def pinhole(K: Float[np.ndarray | Tensor, "3 3"], size: tuple[int, int]) -> "Lens":
+        """The lens without distortion of intrinsics K and images of (width, height) [px]."""
+        (fx, _, cx), (_, fy, cy), _ = K.tolist()
+        return Lens(*size, (fx, fy), (cx, cy))
 
     def checked(self, undistort: bool = True) -> "Lens":
         """This lens, if it can be used.
@@ -219,9 +227,7 @@ def pinhole_matrix(lens: Lens) -> Float[np.ndarray, "3 3"]:
         ValueError: If the distortion is too strong.
     """
     zoom = filling_zoom(lens)
-    return np.array(
-        [[zoom * lens.focal[0], 0.0, lens.center[0]], [0.0, zoom * lens.focal[1], lens.center[1]], [0.0, 0.0, 1.0]]
-    )
+    return intrinsic_matrix((zoom * lens.focal[0], zoom * lens.focal[1]), lens.center)
 
 
 @lru_cache(maxsize=4)

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from warpgs.cameras import intrinsic_matrix
+
 from .capture import Frame, TakenFrame
 from .lens import MAX_ZOOM, Lens
 
@@ -60,14 +62,12 @@ def _read_taken(read: Callable[[str, Lens], Frame], lenses: Mapping[str, Lens], 
 def _wide_pinhole(lens: Lens) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int], Float[np.ndarray, "H W 2"]]:
     """K and (width, height) of the wide camera, and ``TakenFrame.positions``."""
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    (fx, fy), (cx, cy) = lens.focal, lens.center
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     x, y = lens.unproject(u, v)
-    positions = np.stack([fx * x + cx, fy * y + cy], -1)
+    positions = np.moveaxis(without_distortion(lens).image(x, y), 0, -1)
     error = np.abs(lens.image(x, y) - np.stack([u, v])).max()
     if not error < MAX_ERROR or np.ptp(positions, (0, 1)).max() > MAX_ZOOM * max(lens.width, lens.height):
         raise ValueError(f"the distortion cannot be inverted: {lens.radial}, {lens.tangential}")
     corner = np.floor(positions.min((0, 1))) - MARGIN
     width, height = (np.ceil(positions.max((0, 1))) + MARGIN - corner).astype(int).tolist()
-    K[:2, 2] -= corner
+    K = intrinsic_matrix(lens.focal, (lens.center[0] - corner[0], lens.center[1] - corner[1]))
     return K, (width, height), positions - corner

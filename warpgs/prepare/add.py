@@ -20,7 +20,7 @@ from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.images import decode, is_bright, read_mask
-from warpgs.data.lens import Lens, undistort
+from warpgs.data.lens import Lens, pinhole_matrix, undistort
 from warpgs.data.loaders import LOADERS, LoadOptions, missing_capture, recognize, require_finished
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
@@ -233,8 +233,7 @@ class _Job:
             return
         names = self._names()
         frames, static, planes = self._depth(names, "flow")
-        fx, fy, (cx, cy) = *frames.lens.focal, frames.lens.center
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        K = pinhole_matrix(frames.lens)
         chosen = evenly_spaced_indices(len(names), MAX_POINT_FRAMES)
         views = [DepthView(frames.images[k], planes[k], static[k], K, frames.poses[k]) for k in chosen]
         points, colors = points_of_views(views)
@@ -278,13 +277,13 @@ class _Job:
 
     def _resized(self, names: list[str], side: int, max_factor: float) -> PosedFrames:
         K = np.median([self.capture.cameras[name].K.double().numpy() for name in names], axis=0)
-        common = _pinhole(K, self.capture.cameras[names[0]].size)
+        common = Lens.pinhole(K, self.capture.cameras[names[0]].size)
         images = []
         for name in progress(names, "reading images", self.log is None):
             frame = self.capture.frame(name)
             small = resize_to_side(frame.image.numpy(), side, max_factor)
             height, width = small.shape[:2]
-            own = _pinhole(frame.camera.K.double().numpy(), frame.camera.size).resized(width, height)
+            own = Lens.pinhole(frame.camera.K, frame.camera.size).resized(width, height)
             images.append(_resampled(small, own, common.resized(width, height), cv2.INTER_LINEAR))
         poses = np.array([self.capture.cameras[name].viewmat[:3].double().numpy() for name in names])
         height, width = images[0].shape[:2]
@@ -311,7 +310,7 @@ class _Job:
             return np.ones((lens.height, lens.width), bool)
         camera, distorted = read_camera(self.root / f"camera/{name}.json", self.units, self.factor, 0.0)
         dynamic = ~undistort(read_mask(path, camera.size), distorted)
-        own = _pinhole(camera.K.double().numpy(), camera.size)
+        own = Lens.pinhole(camera.K, camera.size)
         return _resampled(dynamic.astype(np.float32), own, lens, cv2.INTER_LINEAR) < 0.5
 
     def _lens(self, name: str) -> Lens:
@@ -321,10 +320,6 @@ class _Job:
     def _say(self, line: str) -> None:
         if self.log is not None:
             self.log(line)
-
-
-def _pinhole(K: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> Lens:
-    return Lens(*size, (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2])))
 
 
 def _resampled(

@@ -128,7 +128,8 @@ def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.devic
         static = bodies < num_static
         writer.write_image(folder, name, to_bytes(image))
         writer.write_mask(folder, name, static.numpy())
-        writer.write_camera(folder, name, _lens(camera), camera.viewmat[:3, :3].numpy(), camera.position.numpy())
+        lens = Lens.pinhole(camera.K, camera.size)
+        writer.write_camera(folder, name, lens, camera.viewmat[:3, :3].numpy(), camera.position.numpy())
         if side == "left":
             writer.write_depth(folder, name, _monocular(depth, k / scene.num_frames))
             points.append(_surface_points(depth, static, camera, k, scene))
@@ -136,11 +137,6 @@ def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.devic
     writer.write_scene(folder, units, torch.cat(points)[: scene.num_points].numpy(), near=0.05, far=4.0)
     right = {name: int(name.startswith("right")) for name in times}
     writer.write_index(folder, times, [name for name in times if right[name]], right)
-
-
-def _lens(camera: Camera) -> Lens:
-    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-    return Lens(camera.width, camera.height, (fx, fy), (cx, cy))
 
 
 def _monocular(depth: Tensor, phase: float) -> np.ndarray:

@@ -27,7 +27,7 @@ from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.images import decode
-from warpgs.data.lens import Lens
+from warpgs.data.lens import Lens, pinhole_matrix
 from warpgs.data.units import SceneUnits
 from warpgs.visualize.images import to_bytes
 
@@ -116,9 +116,7 @@ def _pose(time: float, shift: float) -> tuple[Float[np.ndarray, "3 3"], Vector]:
 
 def _camera(time: float, shift: float, size: StudioSize) -> Camera:
     rotation, position = _pose(time, shift)
-    focal = 0.82 * size.width
-    K = np.array([[focal, 0.0, 0.5 * size.width], [0.0, focal, 0.5 * size.height], [0.0, 0.0, 1.0]])
-    return Camera.posed(rotation, position, K, (size.width, size.height), time)
+    return Camera.posed(rotation, position, pinhole_matrix(_lens(size)), (size.width, size.height), time)
 
 
 def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:
@@ -191,9 +189,9 @@ def _surface_points(
     count = -(-size.num_points // size.num_frames)
     chosen = random.permutation(len(rows))[:count]
     row, column = rows[chosen], columns[chosen]
-    focal = 0.82 * size.width
-    slopes = [(column + 0.5 - 0.5 * size.width) / focal, (row + 0.5 - 0.5 * size.height) / focal]
-    local = np.stack([*slopes, np.ones(len(row))], 1) / inverse[row, column, None]
+    local = (
+        np.stack([*_lens(size).unproject(column + 0.5, row + 0.5), np.ones(len(row))], 1) / inverse[row, column, None]
+    )
     points = local @ rotation + position + POINT_NOISE * random.standard_normal((len(row), 3))
     return points.round(6).astype(np.float32)
 

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from warpgs.cameras import Camera
+from warpgs.cameras import Camera, intrinsic_matrix
 from warpgs.data.capture import Capture
 
 SMOOTHING = 0.02
@@ -206,8 +206,7 @@ def interpolated(
         positions = PchipInterpolator(x, values[0])(wanted)
     path = []
     for r, p, (fx, fy), (cx, cy, time) in zip(rotations, positions, np.exp(focals), others, strict=True):
-        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        path.append(Camera.posed(r, p, K, first.size, float(time)))
+        path.append(Camera.posed(r, p, intrinsic_matrix((fx, fy), (cx, cy)), first.size, float(time)))
     return path
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warpgs.cameras import Camera
+from warpgs.cameras import Camera, intrinsic_matrix
 
 Vector = tuple[float, ...]
 
@@ -37,7 +37,7 @@ def camera_of(pose: Pose, size: tuple[int, int], time: float) -> Camera:
     world_to_camera = Rotation.from_quat([x, y, z, w]).as_matrix().T
     width, height = size
     focal = 0.5 * height / math.tan(0.5 * pose.fov)
-    K = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    K = intrinsic_matrix((focal, focal), (width / 2, height / 2))
     return Camera.posed(world_to_camera, np.array(pose.position), K, size, time)
 
 

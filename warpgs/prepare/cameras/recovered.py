@@ -127,5 +127,4 @@ def camera_centers(poses: Float[np.ndarray, "F 3 4"]) -> Float[np.ndarray, "F 3"
 
 def pinhole_lens(lens: Lens) -> Lens:
     """The pinhole lens of the images that ``undistort`` makes."""
-    K = pinhole_matrix(lens)
-    return Lens(lens.width, lens.height, (K[0, 0], K[1, 1]), (K[0, 2], K[1, 2]))
+    return Lens.pinhole(pinhole_matrix(lens), (lens.width, lens.height))
