@@ -13,6 +13,7 @@ from warpgs.cameras import Camera, are_comparable
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between, grey_at, grey_levels
 from warpgs.data.sampling import evenly_spaced
+from warpgs.visualize.images import seen_from
 
 from .findings import Finding, Level
 
@@ -71,7 +72,7 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
     size = _reduced_size(first.camera)
     if min(*size, *second.camera.size) < MIN_SIDE or not are_comparable(first.camera, second.camera):
         return None
-    a, (b, is_seen) = grey_at(first, size), _seen_from(first.camera, second, size)
+    a, (b, is_seen) = grey_at(first, size), _turned_like(first.camera, second, size)
     flow, agrees = flow_between(a, b)
     distance = _epipolar_distance(first.camera, second.camera, flow)
     gradient = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
@@ -156,29 +157,18 @@ def _compare_regions(motions: Sequence[Motion]) -> _Regions | None:
     return _Regions(float((dynamic > static).mean()), *medians)
 
 
-def _seen_from(
+def _turned_like(
     camera: Camera, frame: Frame, size: tuple[int, int]
 ) -> tuple[UInt8[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """A frame in grey as if its camera were turned like another one and had its lens; and where it shows anything."""
-    own, other = (c.viewmat[:3, :3].double().numpy() for c in (frame.camera, camera))
     reduced = _reduced_size(frame.camera)
-    centers = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV has pixel centres at whole numbers
-    homography = _intrinsics(camera, size) @ other @ own.T @ np.linalg.inv(_intrinsics(frame.camera, reduced))
-    homography = np.linalg.inv(centers) @ homography @ centers
-    plane = grey_levels(frame, reduced)
-    turned = cv2.warpPerspective(plane, homography, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    seen = cv2.warpPerspective(np.full_like(plane, 255), homography, size, flags=cv2.INTER_NEAREST)
-    return even_contrast(turned), seen > 0
+    turned, is_seen = seen_from(camera.resized(*size), grey_levels(frame, reduced), frame.camera.resized(*reduced))
+    return even_contrast(turned), is_seen
 
 
 def _reduced_size(camera: Camera) -> tuple[int, int]:
     factor = min(1.0, COMPARED_SIDE / max(camera.size))
     return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
-
-
-def _intrinsics(camera: Camera, size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
-    """K of the camera's image in another size."""
-    return np.diag([size[0] / camera.width, size[1] / camera.height, 1.0]) @ camera.K.double().numpy()
 
 
 def _epipolar_distance(first: Camera, second: Camera, flow: Float[np.ndarray, "H W 2"]) -> Float[np.ndarray, "H W"]:
@@ -191,7 +181,7 @@ def _epipolar_distance(first: Camera, second: Camera, flow: Float[np.ndarray, "H
     shift = first.viewmat[:3, :3].double() @ (first.position - second.position).double()
     if float(shift.norm()) < 1e-6:  # pure rotation: every pixel stays where it is
         return np.linalg.norm(flow, axis=-1)
-    e = _intrinsics(first, (width, height)) @ shift.numpy()
+    e = (first.resized(width, height).K.double() @ shift).numpy()
     along = np.stack([e[0] - e[2] * x, e[1] - e[2] * y])
     along /= np.maximum(np.hypot(*along), 1e-12)
     return np.abs(along[0] * flow[..., 1] - along[1] * flow[..., 0])

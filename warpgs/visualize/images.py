@@ -2,10 +2,11 @@
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from warpgs.cameras import Camera
 from warpgs.rendering import Rendering
 
 from .depth import colored
@@ -43,6 +44,28 @@ def averaged(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C
     if factor == 1:
         return image
     return avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
+
+
+def seen_from(
+    camera: Camera, image: UInt8[np.ndarray, "h w *C"], taken: Camera
+) -> tuple[UInt8[np.ndarray, "H W *C"], Bool[np.ndarray, "H W"]]:
+    """An image as a camera at the same place sees it, with any direction, lens and size.
+
+    Args:
+        camera: Camera to show it through.
+        image: Image of ``taken``, in colour or grey.
+        taken: Camera that recorded it.
+
+    Returns:
+        The image, and which of its pixels the given image has.
+    """
+    to_pixels = [(c.K.double() @ c.viewmat[:3, :3].double()).cpu().numpy() for c in (taken, camera)]
+    corner = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV has pixel centres at integers
+    mapping = np.linalg.inv(corner) @ to_pixels[0] @ np.linalg.inv(to_pixels[1]) @ corner
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    inside = cv2.warpPerspective(np.full(image.shape[:2], 255, np.uint8), mapping, camera.size, flags=flags)
+    shown = cv2.warpPerspective(image, mapping, camera.size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
+    return shown.astype(np.uint8), inside > 127
 
 
 def comparison(truth: Float[Tensor, "H W 3"], rendering: Rendering) -> UInt8[np.ndarray, "H2 W5 3"]:
