@@ -52,9 +52,8 @@ def random_capture(splats: Splats, camera: Camera) -> Capture:
     generator = torch.Generator().manual_seed(SEED)
     width, height = camera.size
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    rays = torch.stack([columns - camera.K[0, 2], rows - camera.K[1, 2], torch.full_like(rows, 1)], -1).float()
-    rays[..., :2] /= camera.K[0, 0]
-    static = ~in_disc(rays.reshape(-1, 3), camera).reshape(height, width)
+    at_depth_1 = torch.ones(height * width, dtype=torch.float32)
+    static = ~in_disc(camera.unproject(rows.flatten(), columns.flatten(), at_depth_1), camera).reshape(height, width)
     image = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=generator)
     cameras = {str(k): dataclasses.replace(camera, time=k / (NUM_VIEWS - 1)) for k in range(NUM_VIEWS)}
     inverse_depth = torch.full((height, width), 0.2, dtype=torch.float32)

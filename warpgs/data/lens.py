@@ -161,6 +161,11 @@ class Lens:
             x, y = found[:, 0].T.reshape(2, *np.shape(x))
         return x, y
 
+    def unit_rays(self, positions: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 3"]:
+        """[M, 3] unit vectors in the camera towards what the lens sees at positions [px from the corner]."""
+        rays = np.stack([*self.unproject(positions[:, 0], positions[:, 1]), np.ones(len(positions))], 1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
     def rays(
         self, zoom: float, u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:

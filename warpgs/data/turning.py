@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from .lens import Lens
+
 TOLERANCE = 0.002
 """Distance of a match from where the rotation moves it that counts as explained, relative to the longer side."""
 
@@ -69,7 +71,7 @@ def find_turning(pairs: Sequence[Matches], size: tuple[int, int], focal: float |
         size: (width, height) of the frames [px].
         focal: Focal length [px]; None if unknown.
     """
-    longest, center = max(size), np.array(size) / 2.0
+    longest = max(size)
     usable = [(a, b) for a, b in pairs if len(a) >= MIN_MATCHES]
     if len(usable) < MIN_PAIRS:
         return None
@@ -78,7 +80,8 @@ def find_turning(pairs: Sequence[Matches], size: tuple[int, int], focal: float |
     tolerance = TOLERANCE * longest
 
     def explained(focal: float, pairs: Sequence[Matches]) -> float:
-        return float(np.quantile([_explained(pair, focal, center, tolerance) for pair in pairs], MAX_WORSE_PAIRS))
+        lens = Lens(*size, (focal, focal), (size[0] / 2.0, size[1] / 2.0))
+        return float(np.quantile([_explained(pair, lens, tolerance) for pair in pairs], MAX_WORSE_PAIRS))
 
     if focal is None:
         coarse = max(FOCALS * longest, key=lambda f: explained(f, wide[::3]))
@@ -90,11 +93,11 @@ def _displacement(pair: Matches) -> float:
     return float(np.median(np.linalg.norm(pair[0] - pair[1], axis=1)))
 
 
-def _explained(pair: Matches, focal: float, center: np.ndarray, tolerance: float) -> float:
-    """Fraction of the matches that the best rotation explains."""
-    a, b = (_unit_rays(positions, focal, center) for positions in pair)
-    _, errors = fit_rotation(a, b, tolerance / focal)
-    return float((errors < tolerance / focal).mean())
+def _explained(pair: Matches, lens: Lens, tolerance: float) -> float:
+    """Fraction of the matches that the best rotation explains, up to a distance [px]."""
+    tolerance /= lens.focal[0]
+    _, errors = fit_rotation(lens.unit_rays(pair[0]), lens.unit_rays(pair[1]), tolerance)
+    return float((errors < tolerance).mean())
 
 
 def fit_rotation(
@@ -114,8 +117,3 @@ def fit_rotation(
         errors = np.linalg.norm(turned[:, :2] / np.maximum(turned[:, 2:], 1e-6) - there, axis=1)  # no ray at 90°
         weights = 1.0 / (1.0 + (errors / tolerance) ** 2) ** 2
     return rotation, errors
-
-
-def _unit_rays(positions: np.ndarray, focal: float, center: np.ndarray) -> np.ndarray:
-    rays = np.concatenate([(positions - center) / focal, np.ones((len(positions), 1))], 1)
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -122,7 +122,7 @@ def _with_focal(pairs: Sequence[Matches], lens: Lens) -> Lens:
 
 def _relative(matches: Matches, lens: Lens) -> tuple[Rotation, int] | None:
     """The rotation of a pair and the number of matches that it explains; None if they are too few."""
-    rotation, errors = fit_rotation(_rays(matches[0], lens), _rays(matches[1], lens), TOLERANCE / lens.focal[0])
+    rotation, errors = fit_rotation(lens.unit_rays(matches[0]), lens.unit_rays(matches[1]), TOLERANCE / lens.focal[0])
     count = int((errors < 2.0 * TOLERANCE / lens.focal[0]).sum())
     return (Rotation.from_matrix(rotation), count) if count >= MIN_MATCHES else None
 
@@ -149,13 +149,6 @@ def _chained(count: int, relative: Mapping[Pair, tuple[Rotation, int]]) -> list[
 def _thinned(matches: Matches) -> Matches:
     chosen = evenly_spaced_indices(len(matches[0]), MAX_MATCHES)
     return matches[0][chosen], matches[1][chosen]
-
-
-def _rays(positions: Float[np.ndarray, "M 2"], lens: Lens) -> Float[np.ndarray, "M 3"]:
-    """[M, 3] unit rays of pixels."""
-    x, y = lens.unproject(positions[:, 0], positions[:, 1])
-    rays = np.stack([x, y, np.ones_like(x)], 1)
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
@@ -225,7 +218,7 @@ class _Problem:
         return dataclasses.replace(self.lens, focal=focal, radial=(k1 + values.get("distortion", 0.0), k2, k3))
 
     def _turned(self, rotations: np.ndarray, lens: Lens) -> Float[np.ndarray, "M 3"]:
-        inward = np.einsum("mji,mj->mi", rotations[self.a], _rays(self.seen_a, lens))
+        inward = np.einsum("mji,mj->mi", rotations[self.a], lens.unit_rays(self.seen_a))
         return np.einsum("mij,mj->mi", rotations[self.b], inward)
 
     @staticmethod
