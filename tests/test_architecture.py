@@ -16,7 +16,7 @@ ORDER = [
     "kernels",
     "runtime",
     "ops",
-    "cameras",
+    "cameras least_squares",
     "model",
     "rendering",
     "visualize",

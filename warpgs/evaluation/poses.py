@@ -1,6 +1,7 @@
 """Alignment of held-out cameras to a scene whose training poses were corrected (direct image alignment)."""
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,6 +11,7 @@ from torch.nn.functional import huber_loss
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.data.capture import Frame
+from warpgs.least_squares import Problem, minimize
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.splats import Splats
 from warpgs.rendering import render
@@ -26,10 +28,6 @@ DIFFERENCE = 0.15
 
 ROBUST_ERROR = 0.03
 """Error of a channel, in [0, 1], beyond which the loss grows linearly: what moves may be at another place."""
-
-DAMPING, DAMPING_FACTOR = 1e-3, 10.0
-"""Initial damping of Levenberg and Marquardt, and the factor by which failures raise it and successes lower it."""
-
 
 Align = Callable[[Frame], Camera]
 """The camera of a frame, on the device of the scene."""
@@ -90,40 +88,15 @@ def aligned_camera(
         difference = render(splats, moved(pose), settings=settings).joint.image - truth
         return (difference if region is None else difference[region]).flatten()
 
-    return moved(
-        _minimize(errors, torch.zeros(6, dtype=torch.float32, device=device), DIFFERENCE / float(camera.K[0, 0]))
-    )
-
-
-def _minimize(errors: Errors, pose: Float[Tensor, "6"], width: float) -> Float[Tensor, "6"]:
-    """The pose with the smallest Huber loss of the errors, from a pose on, by the method of Levenberg and Marquardt.
-
-    Derivatives of the errors by the pose, of which there are six, are differences over a width.
-    """
-    error, damping = errors(pose), DAMPING
-    loss = _loss(error)
-    normal, gradient = _normal_equations(errors, pose, error, width)
-    for _ in range(MAX_TRIALS):
-        # The small number keeps the matrix regular where no pixel depends on the pose.
-        damped = normal + (damping * normal.diagonal() + 1e-9).diag()
-        trial = (pose - torch.linalg.solve(damped, gradient)).clamp(-MAX_CORRECTION, MAX_CORRECTION)
-        trial_error = errors(trial)
-        trial_loss = _loss(trial_error)
-        if not trial_loss < loss:
-            damping *= DAMPING_FACTOR
-            continue
-        gain, damping = 1.0 - trial_loss / loss, damping / DAMPING_FACTOR
-        pose, error, loss = trial, trial_error, trial_loss
-        if gain < MIN_GAIN:
-            break
-        normal, gradient = _normal_equations(errors, pose, error, width)
-    return pose
+    problem = Problem(errors, _loss, partial(_normal_equations, errors, DIFFERENCE / float(camera.K[0, 0])))
+    start = torch.zeros(6, dtype=torch.float32, device=device)
+    return moved(minimize(problem, start, MAX_TRIALS, MIN_GAIN, MAX_CORRECTION))
 
 
 def _normal_equations(
-    errors: Errors, pose: Float[Tensor, "6"], error: Float[Tensor, " M"], width: float
+    errors: Errors, width: float, pose: Float[Tensor, "6"], error: Float[Tensor, " M"]
 ) -> tuple[Float[Tensor, "6 6"], Float[Tensor, "6"]]:
-    """JᵀWJ and JᵀWe, of the errors e with derivatives J and the weights W that make their squares the Huber loss."""
+    """Those of ``Problem``, with differences over a width as derivatives."""
     axes = torch.eye(len(pose), dtype=torch.float32, device=pose.device)
     roots = error.abs().clamp_min(ROBUST_ERROR).rsqrt()  # of the weights
     derivatives = torch.stack([(errors(pose + width * axis) - error) * (roots / width) for axis in axes])

@@ -11,14 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from warpgs.data.lens import Lens
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.turning import Matches, find_turning, fit_rotation
+from warpgs.least_squares import Problem, minimize
 
 from .recovered import Cameras, NoCamerasError
 
@@ -179,32 +182,18 @@ class _Problem:
     def solve(self, start: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, "F 3 3"], Lens]:
         """The rotations and the lens that fit best. The first frame keeps its direction."""
 
-        def state(x: np.ndarray) -> tuple[np.ndarray, Lens]:
-            turns = np.concatenate([np.zeros((1, 3)), x[: 3 * len(start) - 3].reshape(-1, 3)])
-            return Rotation.from_rotvec(turns).as_matrix() @ start, self._lens(x[3 * len(start) - 3 :])
+        def state(x: Tensor) -> tuple[np.ndarray, Lens]:
+            turns, changes = np.split(x.numpy(), [3 * len(start) - 3])
+            turns = np.concatenate([np.zeros((1, 3)), turns.reshape(-1, 3)])
+            return Rotation.from_rotvec(turns).as_matrix() @ start, self._lens(changes)
 
-        def cost(residuals: np.ndarray) -> float:
-            return float(np.log1p((residuals**2).sum(1) / SCALE**2).sum())
-
-        # SciPy's least_squares takes many iterations: with a sparse Jacobian, its steps span only two directions.
-        x, damping = np.zeros(3 * len(start) - 3 + len(self.free)), 1e-3
-        residuals = self.residuals(*state(x))
-        for _ in range(MAX_STEPS):
-            jacobian = self._jacobian(*state(x), x)
-            weights = np.repeat(1.0 / (1.0 + (residuals**2).sum(1) / SCALE**2), 2)
-            weighted = jacobian.multiply(weights[:, None]).tocsr()
-            normal, gradient = (weighted.T @ jacobian).toarray(), weighted.T @ residuals.ravel()
-            diagonal = np.diag(normal.diagonal() + 1e-9)
-            change = x - np.linalg.solve(normal + damping * diagonal, gradient)
-            changed = self.residuals(*state(change))
-            if not cost(changed) < cost(residuals):
-                damping *= 10.0
-                continue
-            is_done = cost(residuals) - cost(changed) < MIN_DECREASE * cost(residuals)
-            x, residuals, damping = change, changed, damping / 10.0
-            if is_done:
-                break
-        return state(x)
+        problem = Problem(
+            residuals=lambda x: torch.from_numpy(self.residuals(*state(x))),
+            loss=lambda residuals: float((residuals.square().sum(1) / SCALE**2).log1p().sum()),
+            normal_equations=lambda x, residuals: self._normal_equations(*state(x), x.numpy(), residuals.numpy()),
+        )
+        unchanged = torch.zeros(3 * len(start) - 3 + len(self.free), dtype=torch.float64)
+        return state(minimize(problem, unchanged, MAX_STEPS, MIN_DECREASE))
 
     def residuals(self, rotations: Float[np.ndarray, "F 3 3"], lens: Lens) -> Float[np.ndarray, "M 2"]:
         """[M, 2] distances of the positions in b from where the rotations move those in a [px]."""
@@ -225,6 +214,15 @@ class _Problem:
     def _project(rays: Float[np.ndarray, "M 3"], lens: Lens) -> Float[np.ndarray, "M 2"]:
         depth = np.maximum(rays[:, 2], 0.05)  # no ray at 90° from the axis
         return lens.image(rays[:, 0] / depth, rays[:, 1] / depth).T
+
+    def _normal_equations(
+        self, rotations: np.ndarray, lens: Lens, x: np.ndarray, residuals: Float[np.ndarray, "M 2"]
+    ) -> tuple[Float[Tensor, "P P"], Float[Tensor, " P"]]:
+        """Those of ``least_squares.Problem``, with the weights of Cauchy's loss."""
+        jacobian = self._jacobian(rotations, lens, x)
+        weights = np.repeat(1.0 / (1.0 + (residuals**2).sum(1) / SCALE**2), 2)
+        weighted = jacobian.multiply(weights[:, None]).tocsr()
+        return torch.from_numpy((weighted.T @ jacobian).toarray()), torch.from_numpy(weighted.T @ residuals.ravel())
 
     def _jacobian(self, rotations: np.ndarray, lens: Lens, x: np.ndarray) -> sparse.csr_matrix:
         """[2 M, len(x)]: turning b by ω moves the ray X by ω × X, and turning a by ω by −(R_b R_aᵀ ω) × X."""
