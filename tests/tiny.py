@@ -14,14 +14,14 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from tests import plain
+from warpgs.command_line.interrupt import Interrupt
 from warpgs.config import TrainConfig
 from warpgs.data.loaders import LoadOptions, load_with
 from warpgs.initialization.prepare_start import prepare_start
 from warpgs.runs import checkpoint
+from warpgs.runs.logger import TrainingLogger
 from warpgs.runs.run import Run
 from warpgs.synthetic.room import BuiltinScene, builtin_capture
-from warpgs.training.interrupt import Interrupt
-from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import GROUPS
 from warpgs.training.schedule import Action, IterationPlan
 from warpgs.training.trainer import Trainer

@@ -61,7 +61,7 @@ def test_a_stream_that_does_not_know_whether_it_is_a_terminal_gets_whole_lines()
         ("from warpgs.cli import main; main(['train', '--data', 'nerfds/as'])", "CAPTURE (your own video)"),
         ("from warpgs.cli import main; main(['train', '--preset', 'nosuch'])", "got 'nosuch'"),
         (
-            "from warpgs.training.logger import TrainingLogger; TrainingLogger(None, 9, 0).log('long ' * 30 + 'END')",
+            "from warpgs.runs.logger import TrainingLogger; TrainingLogger(None, 9, 0).log('long ' * 30 + 'END')",
             "END",
         ),
     ],

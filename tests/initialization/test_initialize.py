@@ -19,7 +19,7 @@ from warpgs.initialization.point_cloud import (
     unproject,
 )
 from warpgs.model.fields import FIELDS, make_deformation
-from warpgs.training.logger import TrainingLogger
+from warpgs.runs.logger import TrainingLogger
 from warpgs.training.schedule import Protocol
 from warpgs.views.views import Views
 

@@ -7,14 +7,14 @@ import pytest
 from rich.console import Console
 
 from tests.terminal import Terminal
+from warpgs.runs import logger
+from warpgs.runs.logger import Status, TrainingLogger
 from warpgs.sweep import board as module
 from warpgs.sweep.board import Board
 from warpgs.sweep.cells import plan_cells
 from warpgs.sweep.results import notes_of
 from warpgs.sweep.scheduler import Event
 from warpgs.sweep.spec import read_spec
-from warpgs.training import logger
-from warpgs.training.logger import Status, TrainingLogger
 
 SWEEP = """
 import sys, time

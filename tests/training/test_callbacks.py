@@ -14,9 +14,9 @@ from tests import plain, tiny
 from warpgs.config import TrainConfig
 from warpgs.runs import checkpoint, preview
 from warpgs.runs.config_file import read_config
+from warpgs.runs.logger import Status
 from warpgs.training import callbacks, command, trainer
 from warpgs.training import train as script
-from warpgs.training.logger import Status
 from warpgs.training.schedule import Protocol, extended
 
 pytestmark = pytest.mark.usefixtures("quickly")

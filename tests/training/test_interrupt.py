@@ -7,10 +7,10 @@ import threading
 import pytest
 
 from tests import tiny
+from warpgs.command_line.interrupt import Interrupt
 from warpgs.runs import checkpoint
 from warpgs.training import command
 from warpgs.training import train as script
-from warpgs.training.interrupt import Interrupt
 from warpgs.training.step import Step
 from warpgs.training.train import TrainingInterrupted
 

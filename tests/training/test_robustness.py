@@ -15,9 +15,9 @@ from tests import tiny
 from tests.data.captures import edit_json, write_png
 from warpgs.evaluation import evaluate_run, scene_metrics
 from warpgs.runs import checkpoint
+from warpgs.runs.logger import TrainingLogger
 from warpgs.training import command, losses
 from warpgs.training import train as script
-from warpgs.training.logger import TrainingLogger
 from warpgs.training.step import Step
 from warpgs.training.trainer import MAX_ROLLBACKS
 

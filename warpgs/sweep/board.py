@@ -19,7 +19,7 @@ from rich.text import Text
 from warpgs.config import scaled
 from warpgs.files import read_bounded
 from warpgs.runs.checkpoint import list_checkpoints
-from warpgs.training.logger import LINE
+from warpgs.runs.logger import LINE
 from warpgs.training.schedule import Protocol
 
 from .cells import Cell, arguments, evaluation_arguments, finished_metrics, is_evaluated

@@ -15,10 +15,9 @@ from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.errors import one_line
 from warpgs.evaluation.image_quality import psnr
 from warpgs.runs import preview
+from warpgs.runs.logger import Status, TrainingLogger
 from warpgs.runs.trained import TrainedScene
 from warpgs.visualize.images import reduced, to_bytes
-
-from .logger import Status, TrainingLogger
 
 HELD_OUT_TIMES = 20
 """How often held-out views are rendered in a run."""

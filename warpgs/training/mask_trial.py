@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from warpgs.command_line.interrupt import Interrupt
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Assumption, Capture
@@ -14,12 +15,11 @@ from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
 from warpgs.initialization.objects import find_all_objects, num_cut_off
 from warpgs.initialization.prepare_start import prepare_start
+from warpgs.runs.logger import TrainingLogger, ignore
 from warpgs.runtime import ranks
 from warpgs.views.views import Views
 
 from .callbacks import Progress, render_and_compare
-from .interrupt import Interrupt
-from .logger import TrainingLogger, ignore
 from .trainer import Trainer
 
 TRIAL = PRESETS["quick"]

@@ -9,6 +9,7 @@ from pathlib import Path
 from warpgs.captures.check import quick_findings
 from warpgs.captures.findings import Finding
 from warpgs.captures.opening import capture_folder, open_capture
+from warpgs.command_line.interrupt import Interrupt
 from warpgs.config import Device, TrainConfig, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import describe_layout
@@ -22,13 +23,12 @@ from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, require_resumable, write_config, write_start
+from warpgs.runs.logger import TrainingLogger, ignore
 from warpgs.runs.run import MASK_TRIAL, Run, locked_new_folder
 from warpgs.runtime import ranks
 from warpgs.runtime.devices import choose_device
 
 from .callbacks import Callback, HeldOut, Previewer
-from .interrupt import Interrupt
-from .logger import TrainingLogger, ignore
 from .mask_trial import with_trusted_masks
 from .schedule import extended
 from .trainer import Trainer

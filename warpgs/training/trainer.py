@@ -7,12 +7,14 @@ from pathlib import Path
 
 import torch
 
+from warpgs.command_line.interrupt import Interrupt
 from warpgs.config.presets import far_rates
 from warpgs.initialization import alignment, initialize
 from warpgs.initialization.start import Start
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
 from warpgs.runs.captures import require_same_times
+from warpgs.runs.logger import Status, TrainingLogger
 from warpgs.runs.trained import TrainedScene
 from warpgs.runtime import ranks
 from warpgs.runtime.random_numbers import random_numbers
@@ -20,8 +22,6 @@ from warpgs.runtime.random_numbers import random_numbers
 from . import optimizer as optim
 from .callbacks import Callback, Progress
 from .density.adaptation import Adaptation
-from .interrupt import Interrupt
-from .logger import Status, TrainingLogger
 from .sampling import Sampler
 from .schedule import IterationPlan, Phase, Protocol
 from .step import Sample, Step

@@ -12,8 +12,8 @@ from tests.reference.covariance import covariance
 from tests.scenes import error, generator, make_camera, make_splats, relative_error
 from tests.training.density.sets import copies, equal, make_gaussians, make_scene, trained
 from warpgs.model.gaussians import PARAMETERS, Gaussians
+from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.gradient import GradientStrategy, Limits, densify
-from warpgs.training.logger import TrainingLogger
 
 UNIT = 2.0
 CONFIG = plain.densify(gradient=0.5, split_size=0.05)

@@ -10,11 +10,11 @@ from tests import tiny
 from tests.reference.covariance import covariance
 from tests.scenes import generator, relative_error
 from tests.training.density.sets import copies, equal, make_gaussians, trained
+from warpgs.runs.logger import TrainingLogger
 from warpgs.runtime import ranks
 from warpgs.runtime.random_numbers import random_numbers
 from warpgs.training.density.mcmc import add_noise
 from warpgs.training.density.operations import MIN_OPACITY
-from warpgs.training.logger import TrainingLogger
 
 LOSS = dataclasses.replace(tiny.CONFIG.loss, opacity=0.01, scale=0.01)
 DENSIFY = dataclasses.replace(tiny.CONFIG.densify, strategy="mcmc", weakest=0.0)

@@ -17,8 +17,8 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.ops.projection import Geometry, View
 from warpgs.rendering import opacities_on_screen, render
+from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.opacity_reset import reset_opacities
-from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import make_optimizer
 from warpgs.training.schedule import Phase
 

@@ -13,8 +13,8 @@ from tests.scenes import error, generator, relative_error
 from tests.training.density.sets import NETWORK, copies, equal, make_gaussians, make_scene, trained
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
+from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.operations import clone, remove, rotated, shorten_needles, split
-from warpgs.training.logger import TrainingLogger
 
 SIZE = 0.1
 

@@ -12,8 +12,8 @@ from tests.reference.render import render as reference
 from tests.scenes import as_gaussians, error, make_camera, make_splats
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
+from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.prune import Pruned, blend_weights, prune_invisible, remove_weakest, visibility
-from warpgs.training.logger import TrainingLogger
 from warpgs.training.optimizer import make_optimizer
 from warpgs.training.schedule import Phase
 

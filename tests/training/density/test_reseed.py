@@ -14,9 +14,9 @@ from warpgs.config import RenderSettings
 from warpgs.initialization.dynamic_points import DynamicPoints
 from warpgs.initialization.point_cloud import scene_box
 from warpgs.model.gaussians import PARAMETERS, Gaussians
+from warpgs.runs.logger import TrainingLogger
 from warpgs.training import optimizer as optim
 from warpgs.training.density.reseed import gaussians_that_show, lost_fraction, lost_pixels, require_branches, reseed
-from warpgs.training.logger import TrainingLogger
 from warpgs.training.schedule import Phase
 
 PHASE = Phase(

@@ -13,9 +13,9 @@ from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
 from warpgs.runs import checkpoint
+from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density import DENSITY, make_strategy
 from warpgs.training.density.strategy import Strategy
-from warpgs.training.logger import TrainingLogger
 
 
 class Recorder(Strategy):

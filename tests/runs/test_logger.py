@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from warpgs.training import logger
-from warpgs.training.logger import Status, TrainingLogger
+from warpgs.runs import logger
+from warpgs.runs.logger import Status, TrainingLogger
 
 TERMS = {"static": 0.25, "depth": 0.5}
 
