@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from .config import RenderSettings
     from .model.splats import Splats
     from .rendering import render
+    from .runs.progress import Progress
     from .runs.run import open_run
-    from .training.callbacks import Progress
     from .training.train import train
 
     __version__: str
@@ -45,7 +45,7 @@ __all__ = [
 
 _HOMES = {
     "Camera": "cameras",
-    "Progress": "training.callbacks",
+    "Progress": "runs.progress",
     "RenderSettings": "config",
     "Splats": "model.splats",
     "load_capture": "captures.opening",

@@ -9,7 +9,8 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from warpgs.runs import logger
-from warpgs.runs.logger import Status, TrainingLogger
+from warpgs.runs.logger import TrainingLogger
+from warpgs.runs.progress import Status
 
 TERMS = {"static": 0.25, "depth": 0.5}
 

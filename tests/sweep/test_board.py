@@ -8,7 +8,8 @@ from rich.console import Console
 
 from tests.terminal import Terminal
 from warpgs.runs import logger
-from warpgs.runs.logger import Status, TrainingLogger
+from warpgs.runs.logger import TrainingLogger
+from warpgs.runs.progress import Status
 from warpgs.sweep import board as module
 from warpgs.sweep.board import Board
 from warpgs.sweep.cells import plan_cells

@@ -3,19 +3,17 @@
 import dataclasses
 import json
 import time
-from types import SimpleNamespace
 
 import pytest
-import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import warpgs
 from tests import plain, tiny
 from warpgs.config import TrainConfig
-from warpgs.runs import checkpoint, preview
+from warpgs.evaluation.held_out import HELD_OUT_VIEWS
+from warpgs.runs import preview
 from warpgs.runs.config_file import read_config
-from warpgs.runs.logger import Status
-from warpgs.training import callbacks, command, trainer
+from warpgs.training import command, trainer
 from warpgs.training import train as script
 from warpgs.training.schedule import Protocol, extended
 
@@ -87,7 +85,7 @@ def test_tensorboard_has_psnr_and_images_of_held_out_views(watched):
     assert len(events.Images(f"held-out/{val[0]}")) == len(steps)
     assert len(events.Images(f"held-out/{val[0]}, truth")) == 1
     metrics = json.loads((watched.folder / "metrics.json").read_text())
-    assert len(val) == callbacks.HELD_OUT_VIEWS
+    assert len(val) == HELD_OUT_VIEWS
     assert events.Scalars("psnr/held-out")[-1].value == pytest.approx(metrics["psnr"], abs=1e-3)
 
 
@@ -112,40 +110,6 @@ def test_a_training_that_fails_leaves_no_preview(config):
 def test_a_callback_that_returns_true_ends_training_with_a_checkpoint(config):
     run = warpgs.train(config, callbacks=[lambda progress: progress.status.iteration >= 12])
     assert run.trained_scene().metadata.iteration == 12
-
-
-def test_held_out_views_are_rendered_at_regular_intervals_of_a_run(finished_run, monkeypatch):
-    capture = warpgs.open_run(finished_run).open_capture()
-    image = SimpleNamespace(joint=SimpleNamespace(image=torch.zeros(tiny.SCENE.height, tiny.SCENE.width, 3)))
-    scene, written = SimpleNamespace(render=lambda camera: image), []
-
-    class Logger:
-        def add_image(self, *_: object) -> None:
-            pass
-
-        def add_scalar(self, name: str, value: float, iteration: int) -> None:
-            written.append(iteration)
-
-    held_out = callbacks.HeldOut(Logger())
-    for iteration in range(50, 30_001, 50):
-        held_out(callbacks.Progress(Status(iteration, "stage1", 0.1, 30.0, {}, 1, 1), 30_000, scene, capture))
-    assert len(written) <= callbacks.HELD_OUT_TIMES + 1
-    assert written[-1] == 30_000
-
-
-def test_a_preview_is_the_scene_of_its_iteration(finished_run, tmp_path):
-    scene = warpgs.open_run(finished_run)
-    preview.write(tmp_path, scene, preview.State(7, 9, 21.5, None))
-    loaded = checkpoint.load(tmp_path / preview.SCENE)
-    read = checkpoint.load_scene(loaded, scene.config.model)
-    assert torch.equal(read.static.means, scene.scene.static.means)
-    assert preview.read_state(tmp_path) == preview.State(7, 9, 21.5, None)
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"iteration": "x", "num_iterations": 1, "psnr": 1, "rate": 1}'])
-def test_a_damaged_state_is_none(tmp_path, text):
-    (tmp_path / preview.STATE).write_text(text)
-    assert preview.read_state(tmp_path) is None
 
 
 # Longer runs ----------------------------------------------------------------------------------------------------------
@@ -177,15 +141,3 @@ def test_the_gaussians_of_a_longer_run_settle_at_its_end():
 def test_a_run_is_not_shortened():
     with pytest.raises(ValueError, match="expected at least its 32, got 31"):
         extended(plain.plan(tiny.CONFIG), 31)
-
-
-def test_a_held_out_frame_that_cannot_be_read_ends_the_held_out_images_and_not_the_training():
-    def read(name):
-        raise ValueError(f"{name}.png is damaged")
-
-    lines = []
-    held_out = callbacks.HeldOut(SimpleNamespace(log=lines.append))
-    capture = SimpleNamespace(val=["a"], frame=read)
-    for iteration in (50, 15_000, 30_000):
-        held_out(callbacks.Progress(Status(iteration, "stage1", 0.1, 30.0, {}, 1, 1), 30_000, None, capture))
-    assert lines == ["warning: without held-out views in TensorBoard: a.png is damaged"]

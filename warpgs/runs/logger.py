@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -19,6 +18,7 @@ from torch.utils.tensorboard import summary
 from warpgs.command_line.screen import fitted
 
 from .events import Events
+from .progress import Status
 
 NUM_RECENT = 20
 """Number of reports whose mean speed gives the remaining time: some include pruning or a checkpoint."""
@@ -41,28 +41,6 @@ UNKNOWN = "-:--:--"
 
 def ignore(text: str) -> None:
     """A log that discards its lines."""
-
-
-class Status(NamedTuple):
-    """Progress of a run at one of the regular checks.
-
-    Attributes:
-        iteration: Iterations done.
-        stage: Name of the stage.
-        loss: Mean since the last check.
-        psnr: PSNR of the joint training image, mean since the last check [dB].
-        terms: Each loss term, weighted, mean since the last check; without those that were off.
-        num_static: Number of static Gaussians.
-        num_dynamic: Number of dynamic Gaussians.
-    """
-
-    iteration: int
-    stage: str
-    loss: float
-    psnr: float
-    terms: dict[str, float]
-    num_static: int
-    num_dynamic: int
 
 
 class TrainingLogger:

@@ -1,14 +1,18 @@
 """The scene of a run in training between its checkpoints, written only while a viewer asks for it."""
 
 import json
+import math
 import time
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from warpgs.errors import one_line
 from warpgs.files import read_json, write_text
 
 from . import checkpoint
+from .logger import TrainingLogger
+from .progress import Progress
 from .trained import TrainedScene
 
 REQUEST, SCENE, STATE = ".preview", "preview.safetensors", "preview.json"
@@ -16,6 +20,12 @@ REQUEST, SCENE, STATE = ".preview", "preview.safetensors", "preview.json"
 
 LAPSE_SECONDS = 10.0
 """A request lapses after this time [s]."""
+
+PREVIEW_SECONDS = 2.0
+"""Minimum time between previews [s]."""
+
+PREVIEW_OVERHEAD = 10.0
+"""Minimum time between previews, relative to the time that writing one takes."""
 
 MAX_BYTES = 1 << 16
 """Maximum size of the state [bytes]."""
@@ -84,3 +94,28 @@ def read_state(folder: Path) -> State | None:
         return State(iteration, total, float(values["psnr"]), values["rate"] and float(values["rate"]))
     except (OSError, ValueError, KeyError, TypeError, OverflowError):
         return None
+
+
+class Previewer:
+    """Writes the scene for a viewer of the run folder, while one asks for it; a callback."""
+
+    def __init__(self, folder: Path, logger: TrainingLogger) -> None:
+        self._folder, self._logger = folder, logger
+        self._next = 0.0
+        self._before: tuple[int, float] | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        status, now = progress.status, time.monotonic()
+        before, self._before = self._before, (status.iteration, now)
+        if now < self._next or not is_requested(self._folder):
+            return
+        iterations, seconds = (status.iteration - before[0], now - before[1]) if before else (0, 0.0)
+        rate = iterations / seconds if seconds > 0 else None
+        state = State(status.iteration, progress.num_iterations, status.psnr, rate)
+        try:
+            write(self._folder, progress.scene, state)
+        except OSError as error:  # training goes on without
+            self._logger.log(f"warning: no previews for the viewer: {one_line(error)}")
+            self._next = math.inf
+            return
+        self._next = now + max(PREVIEW_SECONDS, PREVIEW_OVERHEAD * (time.monotonic() - now))

@@ -13,13 +13,14 @@ from warpgs.data.capture import Assumption, Capture
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
+from warpgs.evaluation.held_out import render_and_compare
 from warpgs.initialization.objects import find_all_objects, num_cut_off
 from warpgs.initialization.prepare_start import prepare_start
 from warpgs.runs.logger import TrainingLogger, ignore
+from warpgs.runs.progress import Progress
 from warpgs.runtime import ranks
 from warpgs.views.views import Views
 
-from .callbacks import Progress, render_and_compare
 from .trainer import Trainer
 
 TRIAL = PRESETS["quick"]

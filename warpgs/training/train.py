@@ -16,6 +16,7 @@ from warpgs.data.loaders import describe_layout
 from warpgs.errors import command, is_out_of_memory
 from warpgs.evaluation.evaluate import check_views
 from warpgs.evaluation.evaluate_run import evaluate_run
+from warpgs.evaluation.held_out import HeldOut
 from warpgs.evaluation.lpips import locate
 from warpgs.files import write_json
 from warpgs.initialization.prepare_start import prepare_again, prepare_start
@@ -24,11 +25,12 @@ from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config, require_resumable, write_config, write_start
 from warpgs.runs.logger import TrainingLogger, ignore
+from warpgs.runs.preview import Previewer
+from warpgs.runs.progress import Callback
 from warpgs.runs.run import MASK_TRIAL, Run, locked_new_folder
 from warpgs.runtime import ranks
 from warpgs.runtime.devices import choose_device
 
-from .callbacks import Callback, HeldOut, Previewer
 from .mask_trial import with_trusted_masks
 from .schedule import extended
 from .trainer import Trainer

@@ -14,13 +14,13 @@ from warpgs.initialization.start import Start
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
 from warpgs.runs.captures import require_same_times
-from warpgs.runs.logger import Status, TrainingLogger
+from warpgs.runs.logger import TrainingLogger
+from warpgs.runs.progress import Callback, Progress, Status
 from warpgs.runs.trained import TrainedScene
 from warpgs.runtime import ranks
 from warpgs.runtime.random_numbers import random_numbers
 
 from . import optimizer as optim
-from .callbacks import Callback, Progress
 from .density.adaptation import Adaptation
 from .sampling import Sampler
 from .schedule import IterationPlan, Phase, Protocol
