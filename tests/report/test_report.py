@@ -96,7 +96,7 @@ def test_the_report_lists_the_metrics_of_every_view(tmp_path, run):
     page = report(tmp_path, run)
     for view in read_runs([run])[0].views:
         assert view.name in page.words
-        assert f"{view.metrics['psnr']:.2f}" in page.text
+        assert f"{view.values['psnr']:.2f}" in page.text
 
 
 def test_the_report_has_a_chart_of_every_scalar(tmp_path, run):
@@ -132,7 +132,7 @@ def decoded(uri):
 def test_worst_and_best_views_are_ordered_by_psnr_and_disjoint(run):
     runs = read_runs([run])
     worst, best = extremes(runs, 2)
-    psnr = {view.name: view.metrics["psnr"] for view in runs[0].views}
+    psnr = {view.name: view.values["psnr"] for view in runs[0].views}
     ordered = sorted(psnr, key=psnr.__getitem__)
     assert worst == ordered[:2]
     assert best[0] == ordered[-1]
@@ -497,7 +497,7 @@ def test_a_report_of_several_runs_shows_the_mean_that_it_orders_by_and_says_a_no
     worst, _ = extremes(runs, 1, saved_views(runs[0]))
     strips = [saved_strips(own, worst, "nothing is rendered") for own in runs]
     shown = Page(page(runs, [Gallery([0, 1, 2], worst, [], strips)], "written today"))
-    known = [view.metrics["psnr"] for own in runs for view in own.views if view.name == worst[0]]
+    known = [view.values["psnr"] for own in runs for view in own.views if view.name == worst[0]]
     assert f"mean {sum(known) / 3:.2f} dB" in shown.text
     assert "Ordered by the mean PSNR of the runs." in shown.text
     assert shown.text.count("only views whose images the evaluation saved: nothing is rendered") == 1

@@ -13,6 +13,7 @@ from tensorboard.backend.event_processing.event_accumulator import SCALARS, Even
 
 from warpgs.config import TrainConfig
 from warpgs.errors import command
+from warpgs.evaluation.evaluate import ViewMetrics
 from warpgs.evaluation.metrics import METRICS
 from warpgs.files import read_bounded, read_json, require_file
 from warpgs.runs.config_file import read_config
@@ -34,21 +35,6 @@ REQUIRED = ("name", "time", "psnr")
 
 
 @dataclass(frozen=True)
-class View:
-    """One line of views.csv.
-
-    Attributes:
-        name: Id of the view.
-        time: Its time in [0, 1].
-        metrics: Metrics by name; None where not measured.
-    """
-
-    name: str
-    time: float
-    metrics: dict[str, float | None]
-
-
-@dataclass(frozen=True)
 class EvaluatedRun:
     """A run that was evaluated.
 
@@ -65,7 +51,7 @@ class EvaluatedRun:
     folder: Path
     config: TrainConfig
     metrics: dict[str, Any]
-    views: list[View]
+    views: list[ViewMetrics]
     curves: dict[str, Curve]
 
 
@@ -126,7 +112,7 @@ def _check_evaluated(path: Path) -> None:
         raise ValueError(f"{path.parent} has no {path.name}: evaluate it with {command('eval', path.parent)}")
 
 
-def _read_views(path: Path) -> list[View]:
+def _read_views(path: Path) -> list[ViewMetrics]:
     _check_evaluated(path)
     data = read_bounded(path, MAX_FILE)
     try:
@@ -139,16 +125,16 @@ def _read_views(path: Path) -> list[View]:
     return [_view(path, number, header, row) for number, row in enumerate(rows, 2)]
 
 
-def _view(path: Path, line: int, header: list[str], row: list[str]) -> View:
+def _view(path: Path, line: int, header: list[str], row: list[str]) -> ViewMetrics:
     if len(row) != len(header):
         raise ValueError(f"{path} is damaged: line {line} has {len(row)} columns, not {len(header)}")
     texts = dict(zip(header, row, strict=True))
     name = texts.pop("name")
-    metrics = {key: _metric(f"{path}: line {line}: {key}", text) for key, text in texts.items()}
-    time = metrics.pop("time") or 0.0
+    values = {key: _metric(f"{path}: line {line}: {key}", text) for key, text in texts.items()}
+    time = values.pop("time") or 0.0
     if math.isinf(time):
         raise ValueError(f"{path}: line {line}: time cannot be infinite")
-    return View(name, time, metrics)
+    return ViewMetrics(name, time, values)
 
 
 def _metric(name: str, text: str) -> float | None:

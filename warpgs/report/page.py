@@ -149,7 +149,7 @@ def _charts(runs: Sequence[EvaluatedRun]) -> str:
 
 
 def _over_time(index: int, run: EvaluatedRun, name: str) -> Series:
-    known = [(view.time, value) for view in run.views if (value := view.metrics.get(name)) is not None]
+    known = [(view.time, value) for view in run.views if (value := view.values.get(name)) is not None]
     return Series(run.label, color_of(index), sorted((t, v) for t, v in known if math.isfinite(v)))
 
 
@@ -179,14 +179,14 @@ def _gallery(runs: Sequence[EvaluatedRun], gallery: Gallery) -> str:
 
 def _gallery_row(runs: Sequence[EvaluatedRun], gallery: Gallery, name: str) -> str:
     truths = [strips.by_view[name].truth for strips in gallery.strips if name in strips.by_view]
-    scores = [view.metrics.get("psnr") for k in gallery.runs for view in runs[k].views if view.name == name]
+    scores = [view.values.get("psnr") for k in gallery.runs for view in runs[k].views if view.name == name]
     known = [score for score in scores if score is not None]
     mean = f"<br>mean {statistics.fmean(known):.2f} dB" if len(scores) > 1 and known else ""
     image = _image(truths[0], f"ground truth of {name}") if truths else ""
     cells = [f"<td>{image}{text(name)}{mean}</td>"]
     for index, strips in zip(gallery.runs, gallery.strips, strict=True):
         view = next(view for view in runs[index].views if view.name == name)
-        psnr = view.metrics.get("psnr")
+        psnr = view.values.get("psnr")
         quality = "" if psnr is None else f"{psnr:.2f} dB"
         if name not in strips.by_view:
             cells.append(f"<td colspan={len(PER_RUN)}>{text(quality)} (no image)</td>")
@@ -201,12 +201,12 @@ def _gallery_row(runs: Sequence[EvaluatedRun], gallery: Gallery, name: str) -> s
 def _views(runs: Sequence[EvaluatedRun]) -> str:
     parts = ["<h2>All views</h2>"]
     for index, run in enumerate(runs):
-        names = dict.fromkeys(name for view in run.views for name, v in view.metrics.items() if v is not None)
+        names = dict.fromkeys(name for view in run.views for name, v in view.values.items() if v is not None)
         head = "".join(f"<th>{text(heading(name))}</th>" for name in ("view", "time", *names))
         rows = "".join(
             f"<tr><td class=text>{text(view.name)}</td><td>{view.time:.4f}</td>"
             + "".join(
-                f"<td>{'' if (value := view.metrics.get(name)) is None else formatted(name, value)}</td>"
+                f"<td>{'' if (value := view.values.get(name)) is None else formatted(name, value)}</td>"
                 for name in names
             )
             + "</tr>"

@@ -63,7 +63,7 @@ def extremes(runs: Sequence[EvaluatedRun], count: int, among: set[str] | None = 
     scores: dict[str, list[float]] = {}
     for run in runs:
         for view in run.views:
-            psnr = view.metrics["psnr"]
+            psnr = view.values["psnr"]
             if psnr is not None and (among is None or view.name in among):
                 scores.setdefault(view.name, []).append(psnr)
     ordered = sorted(scores, key=lambda name: (statistics.fmean(scores[name]), name))
