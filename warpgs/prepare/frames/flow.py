@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from warpgs.data.optical_flow import even_contrast
+from warpgs.data.optical_flow import even_contrast, follow
 
 Pair = tuple[int, int]
 
@@ -15,8 +15,8 @@ PATCH_STRIDE, NUM_REFINEMENTS = 4, 2
 """Distance of DIS's patches [px], and its rounds of variational refinement. With 3 px and 5 rounds, those of its medium
 preset, flow takes twice as long and masks are as good."""
 
-TOLERANCE, RELATIVE_TOLERANCE = 0.25, 0.05
-"""Distance by which flow there and back may miss a visible pixel [px], and relative to its displacement."""
+TOLERANCE = 0.25
+"""Distance by which flow there and back may miss a visible pixel [px], besides a part of its displacement."""
 
 
 class Flows:
@@ -98,10 +98,4 @@ class Flows:
 
     def track(self, a: int, b: int) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "H W"]]:
         """Column and row in b of every pixel of a, and whether the flow from there leads back to it (it is visible)."""
-        forward, backward = self.flow(a, b), self.flow(b, a)
-        x, y = self.x + forward[..., 0], self.y + forward[..., 1]
-        outside = (1e4, 1e4, 0.0, 0.0)
-        backward = cv2.remap(backward, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)
-        distance = forward + backward
-        tolerance = TOLERANCE + RELATIVE_TOLERANCE * np.hypot(forward[..., 0], forward[..., 1])
-        return x, y, np.hypot(distance[..., 0], distance[..., 1]) < tolerance
+        return follow(self.flow(a, b), self.flow(b, a), TOLERANCE)
