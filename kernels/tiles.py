@@ -63,7 +63,7 @@ def tile_index(position: float, num_tiles: int) -> int:
 
 
 @wp.func
-def tile_rows(row0: wp.vec4, row1: wp.vec4, half_size: wp.vec2, tiles_y: int) -> wp.vec2i:
+def tile_rows(row0: wp.vec4, half_size: wp.vec2, tiles_y: int) -> wp.vec2i:
     """First and one past the last row of tiles with a pixel centre in the ellipse's bounding box.
 
     Tile k has pixel centres from 16 k + 0.5 to 16 k + 15.5, so the box is shrunk by half a pixel on both sides.
@@ -93,7 +93,7 @@ def num_tiles_of(rows: wp.array2d[wp.vec4], g: int, tiles_x: int, tiles_y: int) 
     row1 = row_load(rows, g, 1)
     if row1[1] != CULLED_LOG2_OPACITY:
         half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
-        span_y = tile_rows(row0, row1, half_size, tiles_y)
+        span_y = tile_rows(row0, half_size, tiles_y)
         for y in range(span_y[0], span_y[1]):
             span_x = tile_columns(row0, row1, half_size, y, tiles_x)
             count += wp.max(span_x[1] - span_x[0], 0)
@@ -163,7 +163,7 @@ def emit_isects(
         row0 = row_load(rows, g, 0)
         row1 = row_load(rows, g, 1)
         half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
-        span_y = tile_rows(row0, row1, half_size, tiles_y)
+        span_y = tile_rows(row0, half_size, tiles_y)
         for y in range(span_y[0], span_y[1]):
             span_x = tile_columns(row0, row1, half_size, y, tiles_x)
             for x in range(span_x[0], span_x[1]):
@@ -189,7 +189,7 @@ def emit_isects(
         row0 = row_load(rows, big_g, 0)
         row1 = row_load(rows, big_g, 1)
         half_size = ellipse_half_size(row0[2], row0[3], row1[0], row1[1] - LOG2_ALPHA_MIN)
-        span_y = tile_rows(row0, row1, half_size, tiles_y)
+        span_y = tile_rows(row0, half_size, tiles_y)
         y_base = span_y[0]
         while y_base < span_y[1]:
             span_x = wp.vec2i(0, 0)

@@ -352,9 +352,7 @@ def read_array(path: Path, max_values: int) -> Shaped[np.ndarray, "..."]:
     return np.array(array)
 
 
-def read_numbers(
-    path: Path, fields: dict[str, Any], key: str, shape: tuple[int, ...], max_magnitude: float = MAX_NUMBER
-) -> Float[np.ndarray, "..."]:
+def read_numbers(path: Path, fields: dict[str, Any], key: str, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Numbers in a field of a JSON object, as an array of double precision.
 
     Args:
@@ -362,10 +360,10 @@ def read_numbers(
         fields: The object.
         key: Name of the field.
         shape: Expected shape; () for a single number.
-        max_magnitude: Maximum absolute value.
 
     Raises:
-        ValueError: If the field is missing, or holds something other than finite numbers of this shape and size.
+        ValueError: If the field is missing, or holds something other than finite numbers of this shape, at most
+            ``MAX_NUMBER`` in magnitude.
     """
     if key not in fields:
         raise ValueError(f"{path} has no {key}")
@@ -379,8 +377,8 @@ def read_numbers(
         raise ValueError(
             f"{path}: {key} must be finite numbers of shape {list(shape)}, got {reprlib.repr(fields[key])}"
         )
-    if values.size and np.abs(values).max() > max_magnitude:
-        raise ValueError(f"{path}: {key} must be at most {max_magnitude:g} in magnitude, got {values.tolist()}")
+    if values.size and np.abs(values).max() > MAX_NUMBER:
+        raise ValueError(f"{path}: {key} must be at most {MAX_NUMBER:g} in magnitude, got {values.tolist()}")
     return values.astype(np.float64)
 
 

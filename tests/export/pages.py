@@ -7,7 +7,6 @@ import re
 import numpy as np
 
 from warpgs.export.baking import PARTS, Baked, Branch
-from warpgs.export.packing import from_planes
 from warpgs.export.page import REPLACED
 from warpgs.export.transform import Levels
 
@@ -37,6 +36,17 @@ def levels(blocks, name, part, metadata, octaves):
 
 def integers(block, shape):
     return from_planes(np.frombuffer(gzip.decompress(from_text(block)), np.uint8), shape)
+
+
+def from_planes(planes, shape):
+    """The integers of shape [K, N, C] that ``to_planes`` encoded, as the player restores them."""
+    keys, num, channels = shape
+    count = keys * num * channels
+    unsigned = np.zeros(count, np.uint32)
+    for k, plane in enumerate(planes.reshape(-1, count) if count else ()):
+        unsigned |= plane.astype(np.uint32) << np.uint32(8 * k)
+    values = (unsigned >> np.uint32(1)).astype(np.int32) ^ -(unsigned & np.uint32(1)).astype(np.int32)
+    return np.ascontiguousarray(values.reshape(keys, channels, num).transpose(0, 2, 1))
 
 
 def from_text(text):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.export.pages import from_planes
 from warpgs.export import packing
 
 RANDOM = np.random.default_rng(0)
@@ -65,7 +66,7 @@ def test_planes_are_lossless(largest, shape):
     levels = RANDOM.integers(-largest, largest, shape, dtype=np.int32, endpoint=True)
     planes = packing.to_planes(levels)
     assert planes.dtype == np.uint8
-    assert (packing.from_planes(planes, shape) == levels).all()
+    assert (from_planes(planes, shape) == levels).all()
 
 
 def test_small_integers_take_one_byte():

@@ -89,14 +89,3 @@ def to_planes(levels: Int32[np.ndarray, "K N C"]) -> UInt8[np.ndarray, " bytes"]
     unsigned = ((values << 1) ^ (values >> 31)).view(np.uint32)
     used = -(-int(unsigned.max(initial=1)).bit_length() // 8)
     return np.ascontiguousarray(unsigned.astype("<u4").view(np.uint8).reshape(-1, 4).T[:used]).reshape(-1)
-
-
-def from_planes(planes: UInt8[np.ndarray, " bytes"], shape: tuple[int, int, int]) -> Int32[np.ndarray, "K N C"]:
-    """The integers of shape [K, N, C] that ``to_planes`` encoded."""
-    keys, num, channels = shape
-    count = keys * num * channels
-    unsigned = np.zeros(count, np.uint32)
-    for k, plane in enumerate(planes.reshape(-1, count) if count else ()):
-        unsigned |= plane.astype(np.uint32) << np.uint32(8 * k)
-    values = (unsigned >> np.uint32(1)).astype(np.int32) ^ -(unsigned & np.uint32(1)).astype(np.int32)
-    return np.ascontiguousarray(values.reshape(keys, channels, num).transpose(0, 2, 1))

@@ -40,16 +40,16 @@ class Body:
     bulge: float = 0.0
 
 
-def euler(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float[Tensor, "3 3"]:
-    """Rotation about x, then y, then z [rad], in double precision."""
+def euler(x: float = 0.0, z: float = 0.0) -> Float[Tensor, "3 3"]:
+    """Rotation about x, then z [rad], in double precision."""
     matrices = []
-    for axis, angle in enumerate((x, y, z)):
+    for axis, angle in ((0, x), (2, z)):
         c, s = math.cos(angle), math.sin(angle)
         m = torch.eye(3, dtype=torch.float64)
         i, j = (axis + 1) % 3, (axis + 2) % 3
         m[i, i], m[i, j], m[j, i], m[j, j] = c, -s, s, c
         matrices.append(m)
-    return matrices[2] @ matrices[1] @ matrices[0]
+    return matrices[1] @ matrices[0]
 
 
 def as_tensors(bodies: Sequence[Body], device: torch.device) -> Bodies:

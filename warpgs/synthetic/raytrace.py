@@ -10,7 +10,7 @@ from warpgs.kernels import raytrace as kernels
 from warpgs.runtime.checks import check_image_size, check_same_device, check_tensor
 from warpgs.runtime.launch import launch
 
-SPHERE, CUBE, TORUS, BLOB = 0, 1, 2, 3
+SPHERE, CUBE, TORUS, BLOB = kernels.SPHERE, kernels.CUBE, kernels.TORUS, kernels.BLOB
 """Unit shapes; the torus is around z and has radii 1 and 0.3, the blob has three lobes around z."""
 
 
