@@ -7,14 +7,12 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import edit_json, write_json
-from warpgs.captures.check import check_capture
+from warpgs.captures.check import check_capture, require_fit
 from warpgs.captures.import_capture import import_capture
 from warpgs.captures.opening import load_capture
-from warpgs.config import TrainConfig
 from warpgs.data.loaders.name_times import times_of_names
 from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.files import natural_order
-from warpgs.training.train import check_capture as check_before_training
 
 SECOND = 10**9
 START = 1305031102 * SECOND + 850 * 10**6
@@ -282,13 +280,13 @@ def test_check_import_and_training_say_where_times_come_from(edited, tmp_path):
     imported, trained = [], []
     import_capture(root, tmp_path / "imported", log=imported.append)
     assert f"note: {sentence}" in imported
-    check_before_training(load_capture(root), TrainConfig(), trained.append)
+    require_fit(load_capture(root), trained.append)
     assert trained.count(sentence) == 1
 
 
 def test_check_and_training_warn_of_times_that_are_guessed(edited):
     root, lines = rename(edited("nerfstudio"), lambda k: "abcdefghijkl"[k]), []
-    check_before_training(load_capture(root), TrainConfig(), lines.append)
+    require_fit(load_capture(root), lines.append)
     start = "warning: times from the sorted order of the names, because images/a.png has no number; number the images"
     assert sum("times from" in line for line in lines) == 1
     assert any(line.startswith(start) for line in lines)
@@ -297,7 +295,7 @@ def test_check_and_training_warn_of_times_that_are_guessed(edited):
 
 def test_guessed_times_are_no_warning_for_a_scene_without_motion(edited):
     root, lines = rename(edited("nerfstudio"), lambda k: "abcdefghijkl"[k]), []
-    check_before_training(load_capture(root), TrainConfig(assume="static"), lines.append)
+    require_fit(load_capture(root).assuming("static"), lines.append)
     assert not any("times from" in line for line in lines)
 
 

@@ -9,13 +9,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import warpgs
 from tests import plain, tiny
-from warpgs.config import TrainConfig
+from warpgs.config import TrainConfig, extended
 from warpgs.evaluation.held_out import HELD_OUT_VIEWS
 from warpgs.runs import preview
 from warpgs.runs.config_file import read_config
 from warpgs.training import command, trainer
 from warpgs.training import train as script
-from warpgs.training.schedule import Protocol, extended
+from warpgs.training.schedule import Protocol
 
 pytestmark = pytest.mark.usefixtures("quickly")
 

@@ -23,6 +23,8 @@ import warpgs
 from tests import tiny
 from tests.data.captures import edit_json, look_away, stop_time
 from warpgs import cli
+from warpgs.captures.check import require_fit
+from warpgs.captures.findings import UnfitCaptureError
 from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
@@ -202,10 +204,10 @@ def test_one_time_for_all_frames_is_a_warning_if_everything_is_assumed_static(tm
     root = tiny.write(tmp_path)
     stop_time(root)
     capture, lines = load_capture(root), []
-    script.check_capture(capture, TrainConfig(assume="static"), lines.append)
+    require_fit(capture.assuming("static"), lines.append)
     assert any(line.startswith("warning: all training frames have one time") for line in lines)
-    with pytest.raises(script.UnfitCaptureError, match="all training frames have one time") as error:
-        script.check_capture(capture, TrainConfig(), lines.append)
+    with pytest.raises(UnfitCaptureError, match="all training frames have one time") as error:
+        require_fit(capture, lines.append)
     assert [finding.level for finding in error.value.findings] == ["error"]
 
 
@@ -505,7 +507,7 @@ def test_train_raises_on_an_unknown_dataset_or_model(config):
 
 def test_train_raises_on_an_unfit_capture(config):
     look_away(config.data)
-    with pytest.raises(script.UnfitCaptureError, match="the cameras do not see the points"):
+    with pytest.raises(UnfitCaptureError, match="the cameras do not see the points"):
         warpgs.train(config)
 
 

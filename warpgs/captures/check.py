@@ -4,6 +4,7 @@ Training runs the cheap part of the same checks before it begins, so that both s
 """
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from warpgs.config.builtin import is_builtin
@@ -15,7 +16,7 @@ from warpgs.files import read_json
 
 from .check_sample import Content, Sample, read_contents
 from .depth_check import check_depth
-from .findings import Finding, Report
+from .findings import Finding, Report, UnfitCaptureError
 from .frames_check import check_counts, check_files
 from .masks_check import are_suspect, check_dynamic_depth, check_empty_masks, check_masks
 from .motion_check import Motion, check_motion, motions_of
@@ -89,6 +90,28 @@ def quick_findings(capture: Capture) -> list[Finding]:
         findings += [*_judge(capture, masks, motions), *check_motion(motions, capture.conventions.masks)]
     findings += [*check_points(sample.capture, sample.names), *check_depth(sample.capture, sample.names)]
     return [f for f in findings if f.level != "note" or f.topic == "files"]
+
+
+def require_fit(capture: Capture, log: Callable[[str], None]) -> None:
+    """Checks a capture before training; logs warnings and where its times come from.
+
+    Args:
+        capture: As for ``quick_findings``.
+        log: Receives lines for the user.
+
+    Raises:
+        UnfitCaptureError: If it has errors that would make training useless.
+        ValueError: If one of three training frames cannot be read; the message names its file.
+    """
+    findings = quick_findings(capture)
+    errors = [finding for finding in findings if finding.level == "error"]
+    for finding in findings:
+        if finding not in errors:
+            log(str(finding))
+    if not capture.time_source.problem and not capture.is_builtin:  # problems are among the warnings
+        log(capture.time_source.text)
+    if errors:
+        raise UnfitCaptureError(errors)
 
 
 def _noted(root: Path) -> list[Finding]:

@@ -60,3 +60,15 @@ class Report:
         lines = [str(f) for f in sorted(self.findings, key=lambda f: order[f.level])]
         verdict = "fit to train on" if self.is_fit else "not fit to train on"
         return "\n".join([*lines, f"{visible(str(self.root))}: {verdict}"])
+
+
+class UnfitCaptureError(ValueError):
+    """The capture has errors that would make training useless.
+
+    Attributes:
+        findings (tuple[Finding, ...]): The errors.
+    """
+
+    def __init__(self, findings: Sequence[Finding]) -> None:
+        super().__init__("; ".join(finding.text for finding in findings))
+        self.findings = tuple(findings)

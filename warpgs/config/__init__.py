@@ -10,7 +10,7 @@ from .masks import MaskPerturbation
 from .model import ModelConfig
 from .optim import OptimConfig
 from .options import NetName, TrainConfig, scaled, validate
-from .plan import Background, Color, Device, Plan
+from .plan import Background, Color, Device, Plan, extended
 from .render_settings import RenderSettings
 from .schedule import Schedule
 
@@ -28,6 +28,7 @@ __all__ = [
     "RenderSettings",
     "Schedule",
     "TrainConfig",
+    "extended",
     "fields",
     "scaled",
     "validate",

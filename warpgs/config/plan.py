@@ -38,3 +38,26 @@ class Plan(TrainConfig):
         values = {name.name: getattr(config, name.name) for name in dataclasses.fields(TrainConfig)}
         values |= {"device": device, "background": background, "iterations": None}
         return Plan(**values, branches_in_stage2=branches_in_stage2)
+
+
+def extended(plan: Plan, iterations: int | None) -> Plan:
+    """The plan of a run whose last stage is longer, so that the run takes ``iterations`` in total.
+
+    Learning rates that decay over the run decay over the longer one: they rise where the run is continued.
+
+    Args:
+        plan: Plan of the run.
+        iterations: Total iterations; the plan stays as it is if None.
+
+    Raises:
+        ValueError: If that is less than the run has.
+    """
+    schedule = plan.schedule
+    total = schedule.num_iterations
+    if iterations is None:
+        return plan
+    if iterations < total:
+        raise ValueError(f"--resume with --iterations extends a run: expected at least its {total}, got {iterations}")
+    last = "stage2" if schedule.stage2 else "stage1"
+    longer = dataclasses.replace(schedule, **{last: getattr(schedule, last) + iterations - total})
+    return dataclasses.replace(plan, schedule=longer)

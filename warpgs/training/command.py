@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from warpgs.captures.findings import UnfitCaptureError
 from warpgs.command_line.parsing import ALWAYS, flags, one_line_errors
 from warpgs.command_line.screen import show, show_error
 from warpgs.config import TrainConfig
@@ -80,7 +81,7 @@ def _former(name: str) -> str:
 def run(config: TrainConfig) -> int:
     """Trains, then evaluates, and prints what happens; returns the exit code."""
     with ending_at_once():
-        from .train import UnfitCaptureError, train  # imports torch, which --help does not need
+        from .train import train  # imports torch, which --help does not need
     try:
         train(config, log=show)
     except UnfitCaptureError as error:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from warpgs.config import Plan, TrainConfig
+from warpgs.config import TrainConfig
 
 from .optimizer import BRANCHES, RatePlan, exponential
 
@@ -86,29 +86,6 @@ class IterationPlan(RatePlan):
     def replaces_gaussians(self) -> bool:
         """Whether Gaussians are added or removed after the iteration."""
         return not REPLACING.isdisjoint(self.actions)
-
-
-def extended(plan: Plan, iterations: int | None) -> Plan:
-    """The plan of a run whose last stage is longer, so that the run takes ``iterations`` in total.
-
-    Learning rates that decay over the run decay over the longer one: they rise where the run is continued.
-
-    Args:
-        plan: Plan of the run.
-        iterations: Total iterations; the plan stays as it is if None.
-
-    Raises:
-        ValueError: If that is less than the run has.
-    """
-    schedule = plan.schedule
-    total = schedule.num_iterations
-    if iterations is None:
-        return plan
-    if iterations < total:
-        raise ValueError(f"--resume with --iterations extends a run: expected at least its {total}, got {iterations}")
-    last = "stage2" if schedule.stage2 else "stage1"
-    longer = replace(schedule, **{last: getattr(schedule, last) + iterations - total})
-    return replace(plan, schedule=longer)
 
 
 class Protocol:

@@ -6,11 +6,10 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from warpgs.captures.check import quick_findings
-from warpgs.captures.findings import Finding
+from warpgs.captures.check import require_fit
 from warpgs.captures.opening import capture_folder, open_capture
 from warpgs.command_line.interrupt import Interrupt
-from warpgs.config import Device, TrainConfig, scaled
+from warpgs.config import Device, TrainConfig, extended, scaled
 from warpgs.data.capture import Capture
 from warpgs.data.loaders import describe_layout
 from warpgs.errors import command, is_out_of_memory
@@ -32,25 +31,12 @@ from warpgs.runtime import ranks
 from warpgs.runtime.devices import choose_device
 
 from .mask_trial import with_trusted_masks
-from .schedule import extended
 from .trainer import Trainer
 
 Log = Callable[[str], None]
 """Receives lines for the user, such as ``print``."""
 
 FINISHED = "training is finished ({} iterations), and the run is evaluated again; a larger --iterations trains on"
-
-
-class UnfitCaptureError(ValueError):
-    """The capture has errors that would make training useless.
-
-    Attributes:
-        findings (tuple[Finding, ...]): The errors.
-    """
-
-    def __init__(self, findings: Sequence[Finding]) -> None:
-        super().__init__("; ".join(finding.text for finding in findings))
-        self.findings = tuple(findings)
 
 
 class TrainingInterrupted(KeyboardInterrupt):
@@ -217,7 +203,8 @@ def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitSta
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
     _check_precision(config)
     locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
-    capture = check_capture(open_capture(config, quiet), config, log)
+    capture = open_capture(config, quiet)
+    require_fit(capture.assuming(config.assume), log)
     _compare_ranks(config, capture)
     folder = str(locks.enter_context(locked_new_folder(config, capture))) if ranks.is_first() else ""
     _read_evaluation_frames(capture, config, quiet)
@@ -267,7 +254,8 @@ def _continued(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.Exi
     run = Run(folder, dataclasses.replace(saved, device=_own_device(config.device or saved.device)))
     _check_precision(run.config)
     locate(run.config.lpips, run.config.lpips_net)
-    capture = check_capture(run.open_capture(quiet), run.config, log)
+    capture = run.open_capture(quiet)
+    require_fit(capture.assuming(run.config.assume), log)
     _compare_ranks(run.config, capture)
     _read_evaluation_frames(capture, run.config, quiet)
     trainer = Trainer(prepare_again(run.config, capture), run.folder)
@@ -300,22 +288,3 @@ def _read_evaluation_frames(capture: Capture, config: TrainConfig, quiet: bool) 
     if ranks.is_first():  # which evaluates
         check_views(capture, config.as_taken, quiet)
     ranks.any_rank(False)  # a lost rank is found here: the others would prepare a start for nothing
-
-
-def check_capture(capture: Capture, config: TrainConfig, log: Log) -> Capture:
-    """The capture, after logging its warnings and where its times come from.
-
-    Raises:
-        UnfitCaptureError: If it has errors that would make training useless.
-        ValueError: If one of three training frames cannot be read; the message names its file.
-    """
-    findings = quick_findings(capture.assuming(config.assume))
-    errors = [finding for finding in findings if finding.level == "error"]
-    for finding in findings:
-        if finding not in errors:
-            log(str(finding))
-    if not capture.time_source.problem and not capture.is_builtin:  # problems are among the warnings
-        log(capture.time_source.text)
-    if errors:
-        raise UnfitCaptureError(errors)
-    return capture
