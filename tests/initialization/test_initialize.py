@@ -20,7 +20,6 @@ from warpgs.initialization.point_cloud import (
 )
 from warpgs.model.fields import FIELDS, make_deformation
 from warpgs.runs.logger import TrainingLogger
-from warpgs.training.schedule import Protocol
 from warpgs.views.views import Views
 
 CAMERA = make_camera()
@@ -78,11 +77,8 @@ def initial_scene(config, capture):
     return initialize.initial_scene(config, capture, views_of(capture), generator())
 
 
-def dynamic_start(capture, alignments, config=CONFIG, deformation=None, fits=None):
-    """The dynamic start of a protocol that fits the motion where masks and depth show it, or as ``fits`` says."""
+def dynamic_start(capture, alignments, config=CONFIG, deformation=None):
     views, deformation = views_of(capture), deformation or torch.nn.Identity()
-    fits = initialize.fits_motion(config, capture, views, alignments, deformation) if fits is None else fits
-    config = Protocol(config, True, fits_motion=fits).config
     return initialize.dynamic_gaussians(config, capture, views, alignments, deformation, generator())
 
 
@@ -477,7 +473,8 @@ def test_without_depth_and_visible_points_dynamic_gaussians_start_at_random_in_t
 
 
 WIDE = dataclasses.replace(NETWORK, depth=2, width=32)
-FITTED = dataclasses.replace(CONFIG, model=WIDE, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=300))
+UNFITTED = dataclasses.replace(CONFIG, model=WIDE)
+FITTED = dataclasses.replace(UNFITTED, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=300))
 RECEDING = torch.stack([ALIGNMENT[0] * DEPTH / depth for depth in (2.5, 2.6, 2.7)])
 """With these alignments the dynamic block recedes from frame to frame."""
 
@@ -510,31 +507,29 @@ def test_the_deformation_is_not_fitted_to_dynamic_pixels_of_unknown_depth():
     assert is_new(deformation)
 
 
-def test_a_start_lacks_a_fit_if_the_protocol_asks_for_one_and_the_depth_of_what_moves_is_unknown():
-    for depth, fits, lacks in ((None, True, True), (None, False, False), (constant_depth(), True, False)):
+def test_a_start_lacks_a_fit_if_the_plan_asks_for_one_and_the_depth_of_what_moves_is_unknown():
+    for depth, config, lacks in ((None, FITTED, True), (None, UNFITTED, False), (constant_depth(), FITTED, False)):
         capture = make_capture(random_points(50), inverse_depth=depth)
-        assert dynamic_start(capture, RECEDING, FITTED, new_deformation(), fits).lacks_fit == lacks
+        assert dynamic_start(capture, RECEDING, config, new_deformation()).lacks_fit == lacks
 
 
-def test_the_deformation_is_fitted_only_if_the_protocol_says_so():
-    """The protocol decides before depth is realigned, and then uses the deformation from the start of stage I."""
+def test_the_deformation_is_fitted_only_if_the_plan_says_so():
+    """It is decided before depth is realigned, and then the deformation is in use from the start of stage I."""
     capture = make_capture(random_points(9), inverse_depth=constant_depth())
-    for fits in (False, True):
+    for config in (UNFITTED, FITTED):
         deformation = new_deformation()
-        dynamic_gaussians(capture, RECEDING, FITTED, deformation, fits)
-        assert is_new(deformation) != fits
+        dynamic_gaussians(capture, RECEDING, config, deformation)
+        assert is_new(deformation) == (config is UNFITTED)
 
 
 @pytest.mark.parametrize(
-    ("assume", "depth", "steps", "fits"),
-    [("masks", True, 5, True), ("masks", False, 5, False), ("masks", True, 0, False), ("dynamic", True, 5, False)],
+    ("assume", "depth", "can"), [("masks", True, True), ("masks", False, False), ("dynamic", True, False)]
 )
-def test_the_deformation_is_fitted_where_masks_and_depth_show_what_moves(assume, depth, steps, fits):
+def test_motion_can_be_fitted_where_masks_and_depth_show_it(assume, depth, can):
     capture = make_capture(random_points(50), inverse_depth=constant_depth() if depth else None).assuming(assume)
-    config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, fit_motion=steps))
-    views = views_of(capture)
-    assert initialize.fits_motion(config, capture, views, ALIGNMENT, new_deformation()) == fits
-    assert not initialize.fits_motion(config, capture, views, ALIGNMENT, torch.nn.Identity())
+    sources = capture, views_of(capture), ALIGNMENT
+    assert initialize.can_fit_motion(*sources, new_deformation()) == can
+    assert not initialize.can_fit_motion(*sources, torch.nn.Identity())
 
 
 @pytest.mark.parametrize("steps", [0, 2])

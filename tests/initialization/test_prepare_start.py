@@ -35,7 +35,7 @@ def test_remedies_use_what_the_views_hold_instead_of_decoding_frames_again(data,
     start = prepare_start(config, load_capture(data))
     start.capture._cached = Mock()
     start.alignments.fill_(torch.nan)  # so that depth by size is looked for
-    for name in ("exposure", "empty masks", "alignment of depth", "depth by size", "motion fit"):
+    for name in ("exposure", "empty masks", "alignment of depth", "depth by size", "lack of motion"):
         module.REMEDIES[name].apply(start)
     start.capture._cached.assert_not_called()
 
@@ -44,6 +44,12 @@ def test_remedies_use_what_the_views_hold_instead_of_decoding_frames_again(data,
 def test_masks_that_are_not_used_are_not_doubted(capture, assume):
     start = prepare_start(dataclasses.replace(tiny.CONFIG, assume=assume), capture)
     assert not module.REMEDIES["empty masks"].applies(start)
+
+
+@pytest.mark.parametrize(("assume", "steps"), [("masks", tiny.SCHEDULE.fit_motion), ("dynamic", 0)])
+def test_the_plan_fits_motion_only_where_masks_and_depth_show_it(capture, assume, steps):
+    plan = prepare_start(dataclasses.replace(tiny.CONFIG, assume=assume), capture).plan
+    assert plan.schedule.fit_motion == steps
 
 
 def test_a_jump_of_exposure_is_divided_out_of_the_views_and_noted(capture, monkeypatch):

@@ -20,7 +20,7 @@ SHORT = plain.schedule(
     densify_until=60,
     reset_every=20,
     prune_every=30,
-    fit_motion=5,
+    fit_motion=0,
     deform_from=25,
     appearance_from=35,
     noise_until=40,
@@ -169,9 +169,9 @@ def test_by_default_the_rate_of_positions_decays_over_the_run(branch):
 
 
 def test_a_deformation_that_was_fitted_to_points_is_in_use_from_the_start_of_stage_1():
-    made = Protocol(CONFIG, has_depth=True, fits_motion=True)
+    made = protocol(schedule={"fit_motion": 5})
     assert [made.phase_at(k).use_deformation for k in (STAGE1 - 1, STAGE1)] == [False, True]
-    assert not Protocol(CONFIG, has_depth=True).phase_at(STAGE1).use_deformation
+    assert not protocol().phase_at(STAGE1).use_deformation
 
 
 # After iteration i of a run, i + 1 − STAGE1 iterations of stage I are done.
@@ -352,7 +352,7 @@ def test_every_schedule_but_those_of_adam_is_scaled_by_the_same_factor(preset, f
 @pytest.mark.parametrize("off", [["pretrain"], ["stage2"], ["pretrain", "stage2"], ["densify_from", "appearance_from"]])
 @pytest.mark.parametrize("iterations", [5, 50, 1003])
 def test_zeros_of_a_schedule_stay_zero_when_it_is_rescaled(off, iterations):
-    schedule = dataclasses.replace(SHORT, settle=30, **dict.fromkeys(off, 0))
+    schedule = dataclasses.replace(SHORT, settle=30, fit_motion=5, **dict.fromkeys(off, 0))
     after = scaled(dataclasses.replace(CONFIG, schedule=schedule, iterations=iterations)).schedule
     assert after.num_iterations == iterations
     assert {name for name, value in dataclasses.asdict(after).items() if value == 0} == set(off)

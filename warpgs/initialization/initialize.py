@@ -80,12 +80,10 @@ def _colored_points(
     return points, color_points(points, seen)
 
 
-def fits_motion(
-    config: TrainConfig, capture: Capture, views: Views, alignments: Float[Tensor, "T 2"], deformation: nn.Module
-) -> bool:
-    """Whether a deformation with parameters is fitted before stage I: where masks and depth show what moves."""
-    is_asked = config.schedule.fit_motion > 0 and bool(list(deformation.parameters()))
-    return is_asked and capture.assumption == "masks" and is_depth_known(views, alignments)
+def can_fit_motion(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"], deformation: nn.Module) -> bool:
+    """Whether a deformation has parameters to fit to what moves, and masks and depth show that."""
+    has_parameters = bool(list(deformation.parameters()))
+    return has_parameters and capture.assumption == "masks" and is_depth_known(views, alignments)
 
 
 class DynamicStart(NamedTuple):
@@ -114,9 +112,9 @@ def dynamic_gaussians(
 
     Without depth they start in front of the points around them, or, as ``model.dynamic_start`` says and without visible
     points, at random positions in the scene's box. If everything is assumed to be dynamic, they start at the sparse
-    points. If nothing is dynamic, there are none. What was tracked starts on its tracks. The
-    deformation is fitted unless ``schedule.fit_motion`` is 0, as a protocol's config has it where ``fits_motion`` is
-    false. The result is None, and the deformation as it was, if ``is_stopped`` says during the fit that it is to stop.
+    points. If nothing is dynamic, there are none. What was tracked starts on its tracks. The deformation is fitted
+    unless ``schedule.fit_motion`` is 0, as in plans where it cannot be. The result is None, and the deformation as it
+    was, if ``is_stopped`` says during the fit that it is to stop.
     """
     if isinstance(deformation, SplineDeformation):
         tracks = find_tracks(capture, views)

@@ -16,7 +16,7 @@ from warpgs.views.views import Views
 
 from .alignment import DepthTrust, align_to_points, require_no_depth
 from .exposure import exposure_gains
-from .initialize import fits_motion
+from .initialize import can_fit_motion
 from .object_depth import fill_object_depth
 from .plan import make_plan
 from .start import Remedy, Start, first_scene
@@ -171,13 +171,15 @@ def _do_without_depth(start: Start) -> Start:
     return start.noted(f"the capture has no depth{made}{reason}")
 
 
-def _motion_can_be_fitted(start: Start) -> bool:
-    return fits_motion(start.plan, start.capture, start.views, start.alignments, start.scene.deformation)
+def _lacks_motion(start: Start) -> bool:
+    """Whether the deformation was to be fitted to points on what moves, and cannot be."""
+    sources = (start.capture, start.views, start.alignments, start.scene.deformation)
+    return start.plan.schedule.fit_motion > 0 and not can_fit_motion(*sources)
 
 
-def _fit_motion(start: Start) -> Start:
-    """Has the deformation fitted to points before stage I, when depth is aligned to the rendering."""
-    return replace(start, fits_motion=True)
+def _do_without_motion(start: Start) -> Start:
+    """Has no deformation fitted before stage I, so that it comes into use later."""
+    return replace(start, plan=replace(start.plan, schedule=replace(start.plan.schedule, fit_motion=0)))
 
 
 REMEDIES: dict[str, Remedy] = {
@@ -187,6 +189,6 @@ REMEDIES: dict[str, Remedy] = {
     "alignment of depth": Remedy(lambda start: True, _align_depth),
     "depth by size": Remedy(lambda start: start.plan.loss.object_depth, _measure_objects),
     "lack of depth": Remedy(_lacks_depth, _do_without_depth),
-    "motion fit": Remedy(_motion_can_be_fitted, _fit_motion),
+    "lack of motion": Remedy(_lacks_motion, _do_without_motion),
 }
 """Remedies by name, in the order in which they are applied before training."""

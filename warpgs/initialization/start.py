@@ -34,7 +34,6 @@ class Start:
         num_aligned: Number of views whose depth could be aligned to the sparse points.
         num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
         num_cut: Number of views in which the border cuts dynamic objects off, if that leaves their depth unknown.
-        fits_motion: Whether the deformation is fitted to points before stage I.
         notes: A sentence of each remedy on what it found or changed.
     """
 
@@ -49,7 +48,6 @@ class Start:
     num_aligned: int = 0
     num_with_objects: int = 0
     num_cut: int | None = None
-    fits_motion: bool = False
     notes: tuple[str, ...] = ()
 
     @property

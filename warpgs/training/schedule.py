@@ -1,6 +1,6 @@
 """What every iteration does: the stages of the paper's protocol and everything that depends on the iteration."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 from warpgs.config import TrainConfig
@@ -95,21 +95,13 @@ class Protocol:
         config: Config whose schedule is rescaled already (``config.scaled``).
         has_depth: Whether any view has depth to compare.
         pretrains: Whether that includes depth of the static region, which pretraining needs.
-        fits_motion: Whether the deformation is fitted to points before stage I, in which it is in use at once then.
         branches_in_stage2: Whether stage II compares the images of the single branches.
     """
 
     def __init__(
-        self,
-        config: TrainConfig,
-        has_depth: bool,
-        pretrains: bool = True,
-        fits_motion: bool = False,
-        branches_in_stage2: bool = True,
+        self, config: TrainConfig, has_depth: bool, pretrains: bool = True, branches_in_stage2: bool = True
     ) -> None:
-        self._branches_in_stage2 = branches_in_stage2
-        self.config = config if fits_motion else replace(config, schedule=replace(config.schedule, fit_motion=0))
-        self.has_depth, self.fits_motion = has_depth, fits_motion
+        self.config, self.has_depth, self._branches_in_stage2 = config, has_depth, branches_in_stage2
         schedule = config.schedule
         pretrain = schedule.pretrain if "dap" not in config.omit and has_depth and pretrains else 0
         # A component that is disabled gives its iterations to stage I, so that runs have equal budgets.
@@ -120,7 +112,7 @@ class Protocol:
         self.stage2 = Stage("stage2", pretrain + stage1, pretrain + stage1 + stage2)
         self.num_iterations = self.stage2.end
         # Iterations of stage I from which the networks are in use; in stage II they always are.
-        deform_from = 0 if fits_motion else schedule.deform_from
+        deform_from = 0 if schedule.fit_motion else schedule.deform_from
         starts = {"deformation": deform_from, "appearance": schedule.appearance_from}
         self._network_starts = {name: stage1 if k is None else min(k, stage1) for name, k in starts.items()}
         self._settle_from = stage1 + stage2 - schedule.settle

@@ -70,9 +70,7 @@ class Trainer:
         self.seconds, self._started = 0.0, time.monotonic()
         self.callbacks: Sequence[Callback] = ()
         self._earlier_peak = 0
-        self.protocol = Protocol(
-            start.plan, start.has_depth, start.num_aligned > 0, start.fits_motion, start.plan.branches_in_stage2
-        )
+        self.protocol = Protocol(start.plan, start.has_depth, start.num_aligned > 0, start.plan.branches_in_stage2)
         self._sampler = Sampler(self.config.seed, len(self.views))
         self._start_from(start.scene)
 
@@ -172,11 +170,10 @@ class Trainer:
 
     def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None, logger: TrainingLogger | None = None) -> bool:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
-        if logger is not None and self.protocol.fits_motion:
-            steps = self.config.schedule.fit_motion
+        if logger is not None and (steps := self.config.schedule.fit_motion):
             logger.log(f"before stage I, {steps:,} steps fit the deformation to points on what moves")
         ranks.any_rank(False)  # finds a lost rank
-        sources = (self.protocol.config, self.capture, self.views, self.alignments, self.scene.deformation)
+        sources = (self.config, self.capture, self.views, self.alignments, self.scene.deformation)
         found = initialize.dynamic_gaussians(
             *sources, self._generator("dynamic"), lambda: interrupt is not None and interrupt.requested
         )
