@@ -32,8 +32,6 @@ PAPER = {
     },
     "Visual Geometry Decomposition: Eq. 10 to 12, dynamic component": {
         "model.deformation": "mlp",
-        "model.paths": 1,  # of the deformation model "splines" alone, like the next
-        "model.path_points": 4,
         "loss.mask_margin": 0.0,
         "assume": "masks",
     },

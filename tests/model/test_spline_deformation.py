@@ -10,12 +10,13 @@ from tests.scenes import error, generator
 from warpgs.model.spline_deformation import SplineDeformation
 
 NUM_PATHS, NUM_POINTS = 3, 9
+NETWORK = plain.model(position_bands=2, time_bands=2, depth=2, width=8)
 
 
 @pytest.fixture
 def model():
-    config = plain.model(position_bands=2, time_bands=2, depth=2, width=8, paths=NUM_PATHS, path_points=NUM_POINTS)
-    found = SplineDeformation(config, torch.zeros(3), torch.ones(3))
+    found = SplineDeformation(NETWORK, torch.zeros(3), torch.ones(3))
+    found.resize(NUM_PATHS, NUM_POINTS)
     found.paths.data.copy_(torch.randn(found.paths.shape, generator=generator()))
     found.homes.copy_(torch.eye(3))
     return found
@@ -50,3 +51,16 @@ def test_only_control_points_around_a_time_have_gradients(model):
     gradients = model.paths.grad.abs().sum((0, 2))
     assert (gradients[:3] > 0).all()
     assert not gradients[4:].any()
+
+
+def test_a_state_brings_the_numbers_of_its_paths_and_points(model):
+    loaded = SplineDeformation(NETWORK, torch.zeros(3), torch.ones(3))
+    loaded.load_state_dict(model.state_dict())
+    means, time = torch.randn(4, 3, generator=generator()), torch.tensor([0.3])
+    assert torch.equal(loaded(means, time), model(means, time))
+
+
+@pytest.mark.parametrize("shape", [(3, 9), (3, 3, 3), (3, 9, 4)])
+def test_a_state_whose_paths_are_no_splines_is_refused(model, shape):
+    with pytest.raises(RuntimeError, match="paths"):
+        model.load_state_dict({**model.state_dict(), "paths": torch.zeros(shape)})

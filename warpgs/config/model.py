@@ -31,11 +31,6 @@ class ModelConfig:
     """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS), unless it is the last one."""
     deformation: str = "mlp"
     """Deformation model, a key of FIELDS in warpgs/model/fields.py; "splines" takes the place of "mlp" on tracks."""
-    paths: Annotated[int, Bounds(min=1, max=4096)] = 1
-    """Number of splines of the deformation model "splines"; training sets it to the number of objects."""
-    path_points: Annotated[int, Bounds(min=4, max=65_536)] = 4
-    """Number of control points of each spline of the deformation model "splines"; training sets it by the number of
-    frames."""
     sh_degree: int = 3
     """Maximum degree of spherical harmonics."""
     appearance_degree: int = 0

@@ -25,7 +25,7 @@ def for_tracks(plan: Plan, tracks: list[Track]) -> Plan:
     model, optim = plan.model, plan.optim
     return dataclasses.replace(
         plan,
-        model=dataclasses.replace(model, deformation="splines", paths=len(tracks), path_points=len(tracks[0].path.c)),
+        model=dataclasses.replace(model, deformation="splines"),
         optim=dataclasses.replace(
             optim,
             networks=min(MAX_RATE, optim.networks),
@@ -62,6 +62,7 @@ def start_from_tracks(
     colors = torch.cat([colors for _, colors in parts])
     chosen = subsample(positions, config.model.dynamic_points, generator)
     gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, MAX_SCALE * view_size)
+    deformation.resize(len(tracks), len(tracks[0].path.c))
     deformation.homes.copy_(starts)
     ranks.copy_first_(deformation.homes)
     units = deformation.network.units[:3].cpu()

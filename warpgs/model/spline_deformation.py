@@ -1,5 +1,7 @@
 """Deformation along paths: each object moves along a spline of its own, and a network adds what is left."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -8,6 +10,9 @@ from warpgs.config import ModelConfig
 
 from .mlp_deformation import MlpDeformation
 
+MIN_POINTS = 4
+"""Number of control points of a spline of one piece."""
+
 
 class SplineDeformation(nn.Module):
     """The movement of the nearest home, a uniform cubic B-spline over time, plus the offsets of ``MlpDeformation``.
@@ -15,7 +20,7 @@ class SplineDeformation(nn.Module):
     For small objects that move far between frames, which a network alone finds neither nor follows exactly.
 
     Args:
-        config: ``paths`` and ``path_points`` are the sizes of the splines; the others are those of the network.
+        config: Sizes of the network; there is one spline, until ``resize`` or a state that is loaded gives others.
         center, half_size: [3] box of the scene.
 
     Attributes:
@@ -29,8 +34,19 @@ class SplineDeformation(nn.Module):
     def __init__(self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> None:
         super().__init__()
         self.network = MlpDeformation(config, center, half_size)
-        self.register_buffer("homes", center.new_zeros(config.paths, 3))
-        self.paths = nn.Parameter(center.new_zeros(config.paths, config.path_points, 3))
+        self.register_buffer("homes", center.new_zeros(1, 3))
+        self.paths = nn.Parameter(center.new_zeros(1, MIN_POINTS, 3))
+
+    def resize(self, num_paths: int, num_points: int) -> None:
+        """Replaces homes and paths by zeros for other numbers of objects, and of control points of each."""
+        self.homes = self.homes.new_zeros(num_paths, 3)
+        self.paths = nn.Parameter(self.paths.new_zeros(num_paths, num_points, 3))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *args: Any) -> None:
+        paths = state_dict.get(f"{prefix}paths")
+        if paths is not None and paths.ndim == 3 and paths.shape[1] >= MIN_POINTS and paths.shape[2] == 3:
+            self.resize(*paths.shape[:2])
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N 10"]:
         """Offsets; see ``fields.FIELDS``. No gradient flows to ``means``."""
