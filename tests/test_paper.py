@@ -26,8 +26,7 @@ PAPER = {
         "model.sh_degree": 3,
         "model.appearance_degree": 3,
         "model.appearance_opacity": True,
-        "static_geometry": False,
-        "static_appearance": False,
+        "frozen": "all",
         "loss.ssim": 0.2,
     },
     "Visual Geometry Decomposition: Eq. 10 to 12, dynamic component": {

@@ -163,6 +163,19 @@ def test_components_had_a_switch_each(run, omitted):
     assert read_config(run).omit == omitted
 
 
+@pytest.mark.parametrize(
+    ("geometry", "appearance", "frozen"),
+    [(True, True, "nothing"), (False, True, "geometry"), (True, False, "appearance"), (False, False, "all")],
+)
+def test_what_stage_2_optimizes_of_static_gaussians_had_two_switches(run, geometry, appearance, frozen):
+    def change(values):
+        del values["frozen"]
+        values |= {"static_geometry": geometry, "static_appearance": appearance}
+
+    edit(run, change)
+    assert read_config(run).frozen == frozen
+
+
 def test_runs_of_a_preset_that_is_gone_keep_their_options(run):
     before = read_config(run)
     edit(run, lambda values: values.update(preset="fast"))
@@ -275,8 +288,8 @@ def test_a_missing_field_that_every_version_writes_is_refused_by_its_name(run, n
 
 
 FIRST = {
-    "": "antialias assume checkpoint_every graph keep_checkpoints resident_bytes seed static_appearance "
-    "static_geometry masks model loss optim densify schedule",
+    "": "antialias assume checkpoint_every graph keep_checkpoints resident_bytes seed "
+    "masks model loss optim densify schedule",
     "densify": "every gradient max_gaussians split_size visibility",
     "loss": "depth depth_dynamic depth_end ssim",
     "masks": "dilate erode holes",
@@ -303,6 +316,7 @@ def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, 
         del values["densify"]["split_size"]
         values["densify"] |= {"dense_fraction": 0.01}
         values |= {"dap": True, "vdp": True, "app": False, "stage2": True}
+        values |= {"static_geometry": False, "static_appearance": False}
 
     edit(run, reduce)
     densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01)

@@ -424,8 +424,8 @@ def test_in_stage_2_the_joint_term_trains_dynamic_gaussians_and_both_networks(mo
     ("options", "trained"),
     [
         ({}, set()),
-        ({"static_geometry": True}, GEOMETRY),
-        ({"static_appearance": True}, EARLY_APPEARANCE | {"sh_rest"}),
+        ({"frozen": "appearance"}, GEOMETRY),
+        ({"frozen": "geometry"}, EARLY_APPEARANCE | {"sh_rest"}),
         ({"omit": ("app",)}, EARLY_APPEARANCE | {"sh_rest"}),
     ],
     ids=["nothing", "geometry", "appearance", "appearance without its network"],

@@ -306,7 +306,7 @@ COURSES = {
     "the depth weight may stay constant": ("depth_weight", {"loss": plain.loss(depth=2.0, depth_end=2.0)}, [2.0] * END),
     "progress rises linearly from zero to one": ("progress", {}, rising_from(0)),
     "that of static positions can end before stage 2": ("means_progress.static", TRAINED, UNTIL_STAGE2),
-    "but not if stage 2 trains them": ("means_progress.static", {"static_geometry": True, **TRAINED}, rising_from(0)),
+    "but not if stage 2 trains them": ("means_progress.static", {"frozen": "appearance", **TRAINED}, rising_from(0)),
     "nor if there is no stage 2": ("means_progress.static", {"omit": ("stage2",), **TRAINED}, rising_from(0)),
     "that of dynamic positions can begin in stage 1": ("means_progress.dynamic", TRAINED, rising_from(STAGE1)),
     "that of a deformation begins with it": ("network_progress.deformation", {}, rising_from(STAGE1 + 25)),

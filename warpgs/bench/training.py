@@ -116,7 +116,7 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
         result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
     scene = random_scene(splats, torch.zeros_like(dynamic), config.model).to(device)
     loss = dataclasses.replace(config.loss, branches_in_stage2="no")
-    plain_config = dataclasses.replace(config, static_geometry=True, loss=loss)
+    plain_config = dataclasses.replace(config, frozen="nothing", loss=loss)
     step = Step(plain_config, scene, views, alignments, trust, capture.view_size)
     plain = dataclasses.replace(plan, phase=plain_phase(plan.phase))
     result["3dgs_ms"] = statistics.median(_times(step, plain, device, repeats))

@@ -71,10 +71,9 @@ class TrainConfig:
     background: BackgroundName | tuple[float, float, float] = "mean"
     """Colour behind all Gaussians: that of the capture, which is white if D-NeRF's images have alpha, else black; the
     same, but the mean colour of the training frames instead of black (mean); or red, green and blue in [0, 1]."""
-    static_geometry: bool = True
-    """Whether stage II still optimizes positions, scales and rotations of static Gaussians."""
-    static_appearance: bool = True
-    """Whether stage II still optimizes w⁰, the appearance to which residuals are added."""
+    frozen: Literal["nothing", "geometry", "appearance", "all"] = "nothing"
+    """What stage II no longer optimizes of static Gaussians: positions, scales and rotations (geometry), w⁰, to which
+    residuals are added (appearance), or both (all; paper)."""
     exposure: bool = True
     """Divide jumps of exposure and white balance between frames out of the training images."""
     antialias: bool = True
@@ -107,6 +106,10 @@ class TrainConfig:
     def render_settings(self) -> RenderSettings:
         """How all images of the run are rendered."""
         return RenderSettings(antialias=self.antialias, max_alpha=self.max_alpha)
+
+    def freezes(self, part: Literal["geometry", "appearance"]) -> bool:
+        """Whether stage II no longer optimizes this part of static Gaussians."""
+        return self.frozen in (part, "all")
 
     def length_unit(self, view_size: float) -> float:
         """Length of 1 in the loss and the noise [scene units], from a capture's view size."""

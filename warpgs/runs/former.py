@@ -31,7 +31,12 @@ def _always(constant: float) -> Removed:
 COMPONENTS = ("dap", "vdp", "app", "stage2")
 """Components of the paper, each of which had a switch."""
 
+FROZEN = {(True, True): "nothing", (False, True): "geometry", (True, False): "appearance", (False, False): "all"}
+"""What stage II kept of static Gaussians, by whether it optimized their geometry and their appearance."""
+
 REMOVED: dict[str, Removed] = {
+    "static_appearance": Removed("--frozen says what stage II keeps"),
+    "static_geometry": Removed("--frozen says what stage II keeps"),
     **{name: Removed(f"--omit {name} omits it") for name in COMPONENTS},
     "densify.depth_gradients": Removed(),
     "densify.max_size": Removed(
@@ -147,31 +152,50 @@ def not_kept(values: dict[str, Any]) -> str | None:
 
 
 def as_today(values: dict[str, Any]) -> dict[str, Any]:
-    """Values as today's version writes those of an earlier one, so that its runs are resumed as they were begun.
-
-    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. A preset that
-    is gone is none: the file has all of its values. ``loss.branches_in_stage2`` was a yes or no, and later what runs as
-    well as what was asked for. A background that was not looked up is black. After ``densify.depth_gradients``, terms
-    of depth count from now on where densification did not look at them.
-    """
+    """Values as today's version writes those of an earlier one, so that its runs are resumed as they were begun."""
     values = {name: dict(value) if isinstance(value, dict) else value for name, value in values.items()}
-    if values.get("preset") in REMOVED_PRESETS:
-        values["preset"] = None
-    if values.get("background") == "capture":
-        values["background"] = "black"
-    if values.get("device") is None:
-        values["device"] = choose_device()
-    if isinstance(loss := values.get("loss"), dict):
-        if isinstance(branches := loss.get("branches_in_stage2"), bool):
-            loss["branches_in_stage2"] = "yes" if branches else "no"
-        values.setdefault("branches_in_stage2", loss.get("branches_in_stage2") != "no")
-        if values.get("dap") is False and "depth_gate" not in loss:
-            loss["depth"] = 0.0
-    if all(isinstance(values.get(name), bool) for name in COMPONENTS):
-        values.setdefault("omit", [name for name in COMPONENTS if not values[name]])
+    for change in CHANGES:
+        change(values)
     for name in REMOVED:
         *section, field = name.split(".")
         part = values.get(section[0]) if section else values
         if isinstance(part, dict):
             part.pop(field, None)
     return values
+
+
+def _looked_up(values: dict[str, Any]) -> None:
+    """A preset that is gone is none: the file has all of its values. A background that was not looked up is black."""
+    if values.get("preset") in REMOVED_PRESETS:
+        values["preset"] = None
+    if values.get("background") == "capture":
+        values["background"] = "black"
+    if values.get("device") is None:
+        values["device"] = choose_device()
+
+
+def _losses(values: dict[str, Any]) -> None:
+    """``loss.branches_in_stage2`` was a yes or no, and later what runs as well as what was asked for.
+
+    Before there was ``loss.depth_gate``, runs without depth-aware pretraining had no depth loss at all. After
+    ``densify.depth_gradients``, terms of depth count from now on where densification did not look at them.
+    """
+    if isinstance(loss := values.get("loss"), dict):
+        if isinstance(branches := loss.get("branches_in_stage2"), bool):
+            loss["branches_in_stage2"] = "yes" if branches else "no"
+        values.setdefault("branches_in_stage2", loss.get("branches_in_stage2") != "no")
+        if values.get("dap") is False and "depth_gate" not in loss:
+            loss["depth"] = 0.0
+
+
+def _switches(values: dict[str, Any]) -> None:
+    """Each component of the paper had a switch, and so had each part of static Gaussians in stage II."""
+    if all(isinstance(values.get(name), bool) for name in COMPONENTS):
+        values.setdefault("omit", [name for name in COMPONENTS if not values[name]])
+    geometry, appearance = values.get("static_geometry"), values.get("static_appearance")
+    if isinstance(geometry, bool) and isinstance(appearance, bool):
+        values.setdefault("frozen", FROZEN[geometry, appearance])
+
+
+CHANGES = (_looked_up, _losses, _switches)
+"""What was written otherwise; each changes the values in place."""

@@ -191,7 +191,7 @@ class Protocol:
         if self.config.optim.means_anneal == "run":
             return dict.fromkeys(BRANCHES, iteration / self.num_iterations)
         start, end = self.stage1.start, self.num_iterations
-        static_end = end if self.config.static_geometry else self.stage1.end
+        static_end = self.stage1.end if self.config.freezes("geometry") else end
         dynamic = max(0, iteration - start) / max(1, end - start)
         return {"static": min(1.0, iteration / max(1, static_end)), "dynamic": dynamic}
 

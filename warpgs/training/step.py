@@ -219,9 +219,9 @@ class Step:
         in_stage2 = phase.stage == "stage2"
         for name, parameter in self.scene.static.named_parameters():
             is_geometry = name in ("means", "quats", "log_scales")
-            appearance = self.config.static_appearance or not phase.use_appearance
-            is_trained = self.config.static_geometry if is_geometry else appearance
-            parameter.requires_grad_(is_trained or not in_stage2)
+            is_frozen = self.config.freezes("geometry" if is_geometry else "appearance")
+            is_frozen &= is_geometry or phase.use_appearance  # without residuals, w⁰ is all there is
+            parameter.requires_grad_(not (is_frozen and in_stage2))
         self.scene.deformation.requires_grad_(phase.use_deformation)
         self.scene.appearance.requires_grad_(phase.use_appearance)
 

@@ -128,11 +128,11 @@ def test_static_needles_alone_are_shortened_in_the_unit_of_densification(data, t
     assert trainer.scene.dynamic.scales.max().item() == pytest.approx(9.0, rel=1e-5)
 
 
-@pytest.mark.parametrize("static_geometry", [True, False])
-def test_training_with_a_limit_ends_without_static_needles(data, tmp_path, static_geometry):
+@pytest.mark.parametrize("frozen", ["nothing", "all"])
+def test_training_with_a_limit_ends_without_static_needles(data, tmp_path, frozen):
     limit = dataclasses.replace(tiny.CONFIG.densify, max_elongation=1.05, split_size=1e-7)
     schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=100)  # until then nothing is removed as too large
-    config = dataclasses.replace(tiny.CONFIG, static_geometry=static_geometry, schedule=schedule)
+    config = dataclasses.replace(tiny.CONFIG, frozen=frozen, schedule=schedule)
     elongations = []
     for densify_config in (config.densify, limit):
         folder = tmp_path / str(densify_config.max_elongation)
