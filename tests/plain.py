@@ -36,7 +36,6 @@ config = partial(
     replace(
         PAPER,
         preset=None,
-        vrig_factor=None,
         undistort=True,
         max_alpha=0.999,
         model=model(),

@@ -83,8 +83,7 @@ PAPER = {
     "3DGS: rasterization": {"max_alpha": 0.99, "background": "capture"},
     "3DGS: initial Gaussians": {"model.bound_sizes": False},
     "Deformable-3DGS: initial Gaussians, in the layouts of NeRF-DS and HyperNeRF": {"model.point_colors": "grey"},
-    "Deformable-3DGS: cameras and frames as they are": {"undistort": False},
-    "Deformable-3DGS: frames of HyperNeRF": {"vrig_factor": 4},
+    "Deformable-3DGS: cameras and frames as they are, factor of HyperNeRF's vrig captures": {"undistort": False},
     "3DGS: depth regularization": {"loss.depth": 1.0, "loss.depth_end": 0.01},
     "code of the authors": {"model.dynamic_points": 100_000, "model.dynamic_start": "uniform", "model.tracks": False},
     "no such thing in the paper": {
@@ -118,7 +117,7 @@ PAPER = {
 
 RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
 RUN |= {"lpips_net", "as_taken"}
-RUN |= {"masks.erode", "masks.dilate", "masks.holes", "checkpoint_every", "keep_checkpoints", "resident_bytes"}
+RUN |= {"damage_masks", "checkpoint_every", "keep_checkpoints", "resident_bytes"}
 """Options of a run that do not belong to the method."""
 
 METHOD = Path(__file__).parents[1] / "docs" / "method.md"

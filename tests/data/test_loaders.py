@@ -142,7 +142,8 @@ def test_without_undistortion_frames_are_those_of_the_files_and_cameras_look_at_
     if dataset != "iphone":
         for root in (plain, bent):
             captures.write_array(root / "depth/1x/left_000000.npy", depth)
-    capture, expected = load_capture(bent, undistort=False), load_capture(plain)
+    factor = captures.FACTORS[dataset]
+    capture, expected = load_capture(bent, factor=factor, undistort=False), load_capture(plain)
     assert capture.read_taken is None
     if k1 > 0:
         assert load_capture(bent).read_taken is not None
@@ -150,7 +151,7 @@ def test_without_undistortion_frames_are_those_of_the_files_and_cameras_look_at_
         with pytest.raises(ValueError, match="too strong to undistort"):
             load_capture(bent)
     for name, camera in capture.cameras.items():
-        factor, (width, height) = captures.FACTORS[dataset], camera.size
+        width, height = camera.size
         K = [[50.0 / factor, 0, width / 2], [0, 50.0 / factor, height / 2], [0, 0, 1]]
         assert torch.equal(camera.K, torch.tensor(K, dtype=torch.float32))
         assert torch.equal(camera.viewmat, expected.cameras[name].viewmat)
@@ -171,19 +172,19 @@ def test_only_depth_of_a_sensor_is_metric(iphone, tmp_path):
     assert not load_capture(iphone).metric_depth
 
 
-def test_captures_of_two_cameras_can_have_a_factor_of_their_own_as_in_the_preset_paper(hypernerf):
+def test_captures_of_two_cameras_have_a_factor_of_their_own_as_in_the_preset_paper(hypernerf):
     for path in (hypernerf / "rgb/2x").iterdir():
         captures.write_png(hypernerf / "rgb/4x" / path.name, image_of(path.stem, (SIZE[0] // 4, SIZE[1] // 4)))
-    sizes = {vrig: load_capture(hypernerf, vrig_factor=vrig).cameras["left_000000"].width for vrig in (None, 4)}
-    assert sizes == {None: SIZE[0] // 2, 4: SIZE[0] // 4}
-    assert load_capture(hypernerf, factor=2, vrig_factor=4).cameras["left_000000"].width == SIZE[0] // 2
+    sizes = [load_capture(hypernerf, undistort=undistort).cameras["left_000000"].width for undistort in (True, False)]
+    assert sizes == [SIZE[0] // 2, SIZE[0] // 4]
+    assert load_capture(hypernerf, factor=2, undistort=False).cameras["left_000000"].width == SIZE[0] // 2
     config = dataclasses.replace(PRESETS["paper"], data=hypernerf)
     assert open_capture(config).cameras["left_000000"].width == SIZE[0] // 4
 
 
 def test_captures_of_one_camera_keep_the_factor_of_the_dataset(hypernerf):
     edit_json(hypernerf / "dataset.json", val_ids=[])
-    assert load_capture(hypernerf, vrig_factor=4).cameras["left_000000"].width == SIZE[0] // 2
+    assert load_capture(hypernerf, undistort=False).cameras["left_000000"].width == SIZE[0] // 2
 
 
 def test_iphone_depth_is_unknown_where_the_sensor_has_no_value_or_a_clamped_one(iphone):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.data.captures import dynamic_block
-from warpgs.config import MaskPerturbation
+from warpgs.config import MaskPerturbation, TrainConfig, validate
 from warpgs.data.masks import connected_regions, perturb
 
 STATIC = np.ones((120, 160), dtype=bool)
@@ -75,3 +75,21 @@ def test_an_entirely_dynamic_mask_can_be_perturbed():
 def test_a_perturbation_out_of_range_is_refused_by_name(changes, field):
     with pytest.raises(ValueError, match=field):
         perturb(STATIC, MaskPerturbation(**changes), "a")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (None, MaskPerturbation()),
+        ("erode:4", MaskPerturbation(erode=4)),
+        ("dilate:2,holes:0.25", MaskPerturbation(dilate=2, holes=0.25)),
+    ],
+)
+def test_damage_is_parsed_from_the_option(text, expected):
+    assert MaskPerturbation.parse(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "erode", "erode:x", "erode:0.5", "shrink:2", "erode:1:2", "erode:1;holes:0.1"])
+def test_damage_that_cannot_be_parsed_is_refused(text):
+    with pytest.raises(ValueError, match=r"^damage_masks must be erode:PIXELS, dilate:PIXELS or holes:FRACTION, got"):
+        validate(TrainConfig(damage_masks=text))

@@ -11,7 +11,7 @@ import torch
 from tests import plain, tiny
 from tests.scenes import error
 from warpgs.captures.opening import load_capture
-from warpgs.config import MaskPerturbation, RenderSettings, TrainConfig, scaled
+from warpgs.config import RenderSettings, TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.locks import lock_folder
 from warpgs.runs import checkpoint, former
@@ -29,7 +29,7 @@ UNUSUAL = dataclasses.replace(
     seed=5,
     omit=("dap", "app"),
     assume="dynamic",
-    masks=MaskPerturbation(erode=2, holes=0.25),
+    damage_masks="erode:2,holes:0.25",
     lpips=Path("/weights"),
 )
 
@@ -176,6 +176,30 @@ def test_what_stage_2_optimizes_of_static_gaussians_had_two_switches(run, geomet
     assert read_config(run).frozen == frozen
 
 
+@pytest.mark.parametrize(("before", "factor"), [(None, 2), (4, 4)])
+@pytest.mark.parametrize("val", [["right"], ["left"]])
+def test_captures_of_two_cameras_had_a_factor_of_their_own(run, tmp_path, before, factor, val):
+    (tmp_path / "dataset.json").write_text(json.dumps({"train_ids": ["left"], "val_ids": val}))
+    edit(run, lambda values: values.update(data=str(tmp_path), dataset="hypernerf", vrig_factor=before))
+    assert read_config(run).factor == (factor if val == ["right"] else None)
+
+
+@pytest.mark.parametrize(
+    ("before", "damage"),
+    [
+        ({"erode": 0, "dilate": 0, "holes": 0.0}, None),
+        ({"erode": 2, "dilate": 0, "holes": 0.25}, "erode:2,holes:0.25"),
+    ],
+)
+def test_damage_to_masks_had_a_section(run, before, damage):
+    def change(values):
+        del values["damage_masks"]
+        values["masks"] = before
+
+    edit(run, change)
+    assert read_config(run).damage_masks == damage
+
+
 def test_runs_of_a_preset_that_is_gone_keep_their_options(run):
     before = read_config(run)
     edit(run, lambda values: values.update(preset="fast"))
@@ -203,7 +227,7 @@ def test_a_background_and_a_device_that_were_not_looked_up_are_black_and_that_of
 def test_runs_with_an_option_that_is_gone_open(run, option):
     before = read_config(run)
     *section, name = option.split(".")
-    edit(run, lambda values: (values[section[0]] if section else values).update({name: 0}))
+    edit(run, lambda values: (values.setdefault(section[0], {}) if section else values).update({name: 0}))
     assert read_config(run) == before
 
 
@@ -272,7 +296,7 @@ def test_a_rate_may_be_a_whole_number(run):
     assert read_config(run).optim.means == 1.0
 
 
-@pytest.mark.parametrize("section", ["masks", "model", "loss", "optim", "densify", "schedule"])
+@pytest.mark.parametrize("section", ["model", "loss", "optim", "densify", "schedule"])
 def test_a_missing_section_is_refused_by_its_name(run, section):
     edit(run, lambda values: values.pop(section))
     with pytest.raises(ValueError, match=rf"config\.json has no section {section}, which every version writes: "):
@@ -289,10 +313,9 @@ def test_a_missing_field_that_every_version_writes_is_refused_by_its_name(run, n
 
 FIRST = {
     "": "antialias assume checkpoint_every graph keep_checkpoints resident_bytes seed "
-    "masks model loss optim densify schedule",
+    "model loss optim densify schedule",
     "densify": "every gradient max_gaussians split_size visibility",
     "loss": "depth depth_dynamic depth_end ssim",
-    "masks": "dilate erode holes",
     "model": "appearance_degree appearance_opacity depth dynamic_points half max_static_points position_bands "
     "sh_degree skip time_bands width",
     "optim": "means networks networks_end sh_dc",
@@ -317,6 +340,7 @@ def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, 
         values["densify"] |= {"dense_fraction": 0.01}
         values |= {"dap": True, "vdp": True, "app": False, "stage2": True}
         values |= {"static_geometry": False, "static_appearance": False}
+        values["masks"] = {"erode": 0, "dilate": 0, "holes": 0.0}
 
     edit(run, reduce)
     densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01)

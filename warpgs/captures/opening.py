@@ -24,7 +24,6 @@ def load_capture(
     dataset: str | None = None,
     *,
     factor: int | None = None,
-    vrig_factor: int | None = None,
     perturbation: MaskPerturbation | None = None,
     cache_frames: int = LoadOptions.cache_frames,
     undistort: bool = LoadOptions.undistort,
@@ -35,11 +34,11 @@ def load_capture(
         root: Folder of the capture, or a built-in one (``config/builtin.py``).
         dataset: Key of ``LOADERS`` (``data/loaders``); recognized from the files if None.
         factor: Downscaling factor of the images; the dataset's default if None.
-        vrig_factor: That of HyperNeRF's captures of two cameras (vrig) if ``factor`` is None.
         perturbation: Perturbation of the training masks; evaluation frames keep the true ones.
         cache_frames: Number of frames to keep in memory.
         undistort: Whether to undistort frames, masks and depth; if not, they are those of the files, and cameras are
-            pinholes of the lens's focal length with the principal point at the centre of the image.
+            pinholes of the lens's focal length with the principal point at the centre of the image. HyperNeRF's
+            captures of two cameras (vrig) have a default factor of 4 then, as in Deformable-3DGS.
 
     Raises:
         ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
@@ -47,7 +46,7 @@ def load_capture(
     if not isinstance(root, str | os.PathLike):
         raise ValueError(f"a capture is opened by the path of its folder, got {reprlib.repr(root)}")
     options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, undistort)
-    capture = load_with(capture_folder(root, factor=factor), dataset, options, vrig_factor)
+    capture = load_with(capture_folder(root, factor=factor), dataset, options)
     capture.is_builtin = is_builtin(root)
     return capture
 
@@ -64,8 +63,9 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     else:
         require_factor("builtin:room", config.factor)
         root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
-    options = LoadOptions(config.factor, config.masks, undistort=config.undistort, depth=config.depth)
-    capture = load_with(root, config.dataset, options, config.vrig_factor)
+    damage = MaskPerturbation.parse(config.damage_masks)
+    options = LoadOptions(config.factor, damage, undistort=config.undistort, depth=config.depth)
+    capture = load_with(root, config.dataset, options)
     capture.is_builtin = config.data is None or is_builtin(config.data)
     if config.background == "capture" or config.background == "mean":
         return capture

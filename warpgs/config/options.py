@@ -35,13 +35,10 @@ class TrainConfig:
     megasam; recognized from its files if omitted."""
     factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
     """Downscaling factor of the images (folder rgb/<factor>x); the dataset's default if omitted."""
-    vrig_factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
-    """Downscaling factor of the images of HyperNeRF's captures of two cameras (vrig), if ``factor`` is omitted;
-    Deformable-3DGS reads them at 4."""
     undistort: bool = True
     """Undistort frames, masks and depth, and keep each camera's principal point. Without it the run is trained and
-    evaluated on frames as they are, with pinhole cameras whose principal point is the centre, as in Deformable-3DGS
-    (paper)."""
+    evaluated on frames as Deformable-3DGS reads them (paper): as they are, with pinhole cameras whose principal point
+    is the centre, and those of HyperNeRF's captures of two cameras (vrig) at a factor of 4."""
     out: Path | None = None
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None
@@ -80,9 +77,11 @@ class TrainConfig:
     """Compensate opacities for the low-pass filter (Mip-Splatting)."""
     max_alpha: Annotated[float, ALPHA_BOUNDS] = RenderSettings.max_alpha
     """Maximum alpha of a Gaussian in a pixel: 0.999 as in gsplat; 0.99 in 3DGS (paper)."""
+    damage_masks: str | None = None
+    """Deliberate damage to the training masks (paper, robustness): erode:PIXELS or dilate:PIXELS of the dynamic region,
+    or holes:FRACTION of it, or several with commas between. Evaluation has the true masks."""
     graph: bool = True
     """On CUDA, replay iterations and the steps of ``schedule.fit_motion`` as CUDA graphs."""
-    masks: MaskPerturbation = field(default_factory=MaskPerturbation)
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
@@ -144,6 +143,7 @@ def validate(config: TrainConfig) -> None:
             "with densify.unit extent, densify.split_size is a fraction of the extent, 0.01 in 3DGS, "
             f"got {densify.split_size}"
         )
+    MaskPerturbation.parse(config.damage_masks)
     names, rgb = get_args(BackgroundName), config.background
     is_rgb = isinstance(rgb, tuple) and len(rgb) == 3 and all(0.0 <= value <= 1.0 for value in rgb)
     if rgb not in names and not is_rgb:

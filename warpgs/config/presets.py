@@ -11,7 +11,6 @@ BEST = TrainConfig()
 PAPER = replace(
     BEST,
     preset="paper",
-    vrig_factor=4,
     undistort=False,
     try_masks=False,
     background="capture",

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from math import isclose, nan
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from warpgs.runtime.devices import choose_device
@@ -34,9 +35,14 @@ COMPONENTS = ("dap", "vdp", "app", "stage2")
 FROZEN = {(True, True): "nothing", (False, True): "geometry", (True, False): "appearance", (False, False): "all"}
 """What stage II kept of static Gaussians, by whether it optimized their geometry and their appearance."""
 
+DAMAGE = {"erode": "PIXELS", "dilate": "PIXELS", "holes": "FRACTION"}
+
 REMOVED: dict[str, Removed] = {
     "static_appearance": Removed("--frozen says what stage II keeps"),
     "static_geometry": Removed("--frozen says what stage II keeps"),
+    "masks": Removed(),
+    **{f"masks.{kind}": Removed(f"it is --damage-masks {kind}:{size} now") for kind, size in DAMAGE.items()},
+    "vrig_factor": Removed("--factor is for these captures, too"),
     **{name: Removed(f"--omit {name} omits it") for name in COMPONENTS},
     "densify.depth_gradients": Removed(),
     "densify.max_size": Removed(
@@ -84,7 +90,6 @@ FORMER: dict[str, dict[str, Any]] = {
         "resume": None,
         "try_masks": False,
         "undistort": True,
-        "vrig_factor": None,
     },
     "densify": {
         "max_elongation": 0.0,
@@ -141,7 +146,7 @@ def not_kept(values: dict[str, Any]) -> str | None:
     """The first removed option of a config.json without which a run would not train on as it was begun."""
     for name, removed in REMOVED.items():
         *section, field = name.split(".")
-        part = values[section[0]] if section else values
+        part = values.get(section[0], {}) if section else values
         try:
             is_kept = field not in part or removed.is_kept(part[field], part)
         except TypeError:
@@ -197,5 +202,22 @@ def _switches(values: dict[str, Any]) -> None:
         values.setdefault("frozen", FROZEN[geometry, appearance])
 
 
-CHANGES = (_looked_up, _losses, _switches)
+def _factor(values: dict[str, Any]) -> None:
+    """HyperNeRF's captures of two cameras had a factor of their own, whatever ``undistort`` is."""
+    data, dataset = values.get("data"), values.get("dataset")
+    if "vrig_factor" not in values or values.get("factor") is not None or not isinstance(data, str):
+        return
+    from warpgs.data.loaders import is_vrig  # imports all loaders, which playing a scene does not need
+
+    if is_vrig(Path(data), dataset):
+        values["factor"] = values["vrig_factor"] or 2
+
+
+def _masks(values: dict[str, Any]) -> None:
+    """Damage to masks was a section of three numbers."""
+    if isinstance(masks := values.get("masks"), dict):
+        values.setdefault("damage_masks", ",".join(f"{kind}:{size}" for kind, size in masks.items() if size) or None)
+
+
+CHANGES = (_looked_up, _losses, _switches, _factor, _masks)
 """What was written otherwise; each changes the values in place."""

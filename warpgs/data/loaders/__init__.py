@@ -4,7 +4,6 @@ To add a dataset, write a ``Loader`` in a new file, add a line to ``LOADERS`` an
 Nerfies derive theirs from ``nerfies.NerfiesLoader``; ``Loader`` itself requires no layout.
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -72,7 +71,7 @@ FALLBACK = "hypernerf"
 """Dataset of a folder that no loader recognizes; the errors of its loader name what is missing."""
 
 
-def load_with(root: Path, dataset: str | None, options: LoadOptions, vrig_factor: int | None = None) -> Capture:
+def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     """Opens the capture in a folder; arguments and errors as for ``load_capture`` (captures/opening.py)."""
     if dataset is not None and dataset not in LOADERS:
         raise ValueError(not_one_of("dataset", dataset, LOADERS))
@@ -86,8 +85,6 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions, vrig_factor
         raise ValueError(missing_capture(root))
     require_finished(root)
     loader = LOADERS[dataset or recognize(root)]
-    if isinstance(loader, HyperNerfLoader) and factor is None and vrig_factor is not None and loader.is_vrig(root):
-        options = replace(options, factor=vrig_factor)
     capture = loader.load(root, options)
     _require_sides(root, capture)
     return capture
@@ -99,6 +96,15 @@ def _require_sides(root: Path, capture: Capture) -> None:
         if min(camera.size) < MIN_SIDE:
             size, expected = f"{camera.width}×{camera.height}", f"at least {MIN_SIDE} pixels per side"
             raise ValueError(f"{root}: frame {name} is {size}, expected {expected}; --factor divides the size of files")
+
+
+def is_vrig(root: Path, dataset: str | None) -> bool:
+    """Whether a folder has one of HyperNeRF's captures of two cameras; false if it cannot be read."""
+    try:
+        loader = LOADERS[dataset or recognize(root)]
+        return isinstance(loader, HyperNerfLoader) and loader.is_vrig(root)
+    except (KeyError, ValueError, OSError):
+        return False
 
 
 def is_capture(root: Path) -> bool:

@@ -1,17 +1,26 @@
 """HyperNeRF: captures of two cameras (vrig-*) and interpolation captures of one camera."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from warpgs.data.capture import Capture
 from warpgs.files import read_json
 
 from .nerfies import LAYOUT, NerfiesLoader, Split, read_ids
+from .options import LoadOptions
 
 
 class HyperNerfLoader(NerfiesLoader):
     """Loads captures of HyperNeRF: factor 2, split by train_ids and val_ids, else by every fourth frame."""
 
     default_factor = 2
+
+    def load(self, root: Path, options: LoadOptions, incomplete_masks: bool = False) -> Capture:
+        """Opens a capture; Deformable-3DGS, which does not undistort, reads those of two cameras at a factor of 4."""
+        if options.factor is None and not options.undistort and self.is_vrig(root):
+            options = replace(options, factor=4)
+        return super().load(root, options, incomplete_masks)
 
     def is_vrig(self, root: Path) -> bool:
         """Whether a capture is of two cameras, of which one trains and the other evaluates."""
