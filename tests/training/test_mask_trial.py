@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 import signal
 import tempfile
 
@@ -13,7 +12,6 @@ import pytest
 from tests import tiny, two_ranks
 from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig
-from warpgs.data.dynamic_regions import MIN_FRAMES
 from warpgs.evaluation import evaluate_run
 from warpgs.synthetic.room import builtin_capture
 from warpgs.training import mask_trial
@@ -82,32 +80,6 @@ def test_masks_are_used_unless_none_are_clearly_better(folder, qualities, withou
     found, lines = decide(folder)
     assert found == assume
     assert f"30.0 dB with the masks and {without:.1f} dB without" in lines[-1]
-
-
-@pytest.mark.parametrize("num_whole", [MIN_FRAMES - 1, MIN_FRAMES])
-def test_unknown_depth_of_objects_is_reported_before_the_trial_is_over(folder, tmp_path, monkeypatch, num_whole):
-    class Stopped(mask_trial.Trainer):
-        def train(self, logger, interrupt):
-            raise ValueError("far enough")
-
-    prepare = mask_trial.prepare_start
-    # Of the frames that are trained on.
-    monkeypatch.setattr(mask_trial, "prepare_start", lambda *of: dataclasses.replace(prepare(*of), num_cut=3))
-
-    shutil.copytree(folder, tmp_path / "capture")
-    whole = load_capture(folder).train[:num_whole]
-    for file in (tmp_path / "capture").glob("resized_mask/*/*.png"):
-        mask = np.full_like(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), 255)
-        height, width = mask.shape
-        is_whole = file.name.split(".")[0] in whole
-        mask[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3 if is_whole else width] = 0
-        cv2.imwrite(str(file), mask)
-    monkeypatch.setattr(mask_trial, "Trainer", Stopped)
-    lines = decide(tmp_path / "capture")[1]
-    assert lines[0].startswith("the masks are estimates: two trainings of ")
-    length = CONFIG.schedule.num_iterations
-    assert lines[1] == f"trial 1 of 2 before the {length} iterations of the run, with the masks:"
-    assert lines[2].startswith("warning: the depth of dynamic objects is unknown") == (num_whole < MIN_FRAMES)
 
 
 @pytest.mark.parametrize("changes", [{"assume": "static"}, {"try_masks": False}])

@@ -143,7 +143,7 @@ def _align_depth(start: Start) -> Start:
 def _measure_objects(start: Start) -> Start:
     """Gives or corrects the depth of dynamic objects by their size."""
     found = fill_object_depth(start.plan, start.capture, start.views, start.alignments, start.depth_error)
-    start = replace(start, num_with_objects=found.num_views, num_cut=found.num_cut)
+    start = replace(start, num_with_objects=found.num_views)
     num, notes = len(start.views), []
     if found.num_views:
         changed = f"{found.num_views} of {num} views"

@@ -33,7 +33,6 @@ class Start:
             none could be aligned.
         num_aligned: Number of views whose depth could be aligned to the sparse points.
         num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
-        num_cut: Number of views in which the border cuts dynamic objects off, if that leaves their depth unknown.
         notes: A sentence of each remedy on what it found or changed.
     """
 
@@ -47,7 +46,6 @@ class Start:
     depth_error: float = 0.0
     num_aligned: int = 0
     num_with_objects: int = 0
-    num_cut: int | None = None
     notes: tuple[str, ...] = ()
 
     @property

@@ -10,16 +10,13 @@ from warpgs.command_line.interrupt import Interrupt
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Assumption, Capture
-from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.resized import reduced_capture
 from warpgs.errors import one_line
 from warpgs.evaluation.held_out import render_and_compare
-from warpgs.initialization.objects import find_all_objects, num_cut_off
 from warpgs.initialization.prepare_start import prepare_start
-from warpgs.runs.logger import TrainingLogger, ignore
+from warpgs.runs.logger import TrainingLogger
 from warpgs.runs.progress import Progress
 from warpgs.runtime import ranks
-from warpgs.views.views import Views
 
 from .trainer import Trainer
 
@@ -65,9 +62,9 @@ def with_trusted_masks(
     log(f"the masks are estimates: two trainings of {length} iterations try them out (--no-try-masks omits them)")
     try:
         log(f"trial 1 of 2 before the {of_run} iterations of the run, with the masks:")
-        following = held_out_psnr(config, small, "masks", log, quiet)
+        following = held_out_psnr(config, small, "masks", quiet)
         log("trial 2 of 2, without the masks:")
-        ignoring = held_out_psnr(config, small, "dynamic", log, quiet)
+        ignoring = held_out_psnr(config, small, "dynamic", quiet)
     except (ValueError, OSError) as error:
         if ranks.num_ranks() > 1:
             raise  # the others would wait for this one
@@ -90,23 +87,13 @@ def _is_wanted(config: TrainConfig, capture: Capture) -> bool:
     return is_asked and is_long and len(capture.train) >= MIN_FRAMES
 
 
-def _warn_of_unknown_depth(views: Views, log: Callable[[str], None]) -> None:
-    """Warns if an object is not whole in enough of all frames either: the trial has held some out."""
-    num_cut = num_cut_off(find_all_objects(views))
-    if num_cut is not None:
-        log(f"warning: {unknown_depth(num_cut, len(views))}")
-
-
-def held_out_psnr(
-    config: TrainConfig, capture: Capture, assume: Assumption, log: Callable[[str], None] = ignore, quiet: bool = True
-) -> float:
+def held_out_psnr(config: TrainConfig, capture: Capture, assume: Assumption, quiet: bool = True) -> float:
     """PSNR of held-out training frames after a short training, mean [dB].
 
     Args:
         config: Config of the run, with the device chosen; the trial has its switches.
         capture: Its capture.
         assume: What is taken as dynamic.
-        log: Receives a warning if the depth of dynamic objects is unknown: the training itself warns after the trial.
         quiet: Whether to show no progress.
 
     Raises:
@@ -118,7 +105,7 @@ def held_out_psnr(
     # Held-out frames keep their exposure, so those that train must do so, too.
     config = dataclasses.replace(config, **parts, iterations=None, exposure=False, assume=assume)
     held_out = capture.train[HELD_OUT // 2 :: HELD_OUT]
-    whole, capture = capture, capture.split([name for name in capture.train if name not in held_out], held_out)
+    capture = capture.split([name for name in capture.train if name not in held_out], held_out)
     values: list[float] = []
 
     def compare(progress: Progress) -> None:  # once training is done
@@ -126,10 +113,7 @@ def held_out_psnr(
             values.extend(render_and_compare(progress.scene, progress.capture.frame(name))[1] for name in held_out)
 
     with tempfile.TemporaryDirectory(prefix="warpgs-trial-") as folder, Interrupt() as interrupt:
-        start = prepare_start(config, capture)
-        if start.num_cut is not None:
-            _warn_of_unknown_depth(Views(whole, start.views.device, start.plan.resident_bytes), log)
-        trainer = Trainer(start, Path(folder))
+        trainer = Trainer(prepare_start(config, capture), Path(folder))
         trainer.callbacks = [compare]
         with TrainingLogger(None, trainer.protocol.num_iterations, 0, quiet, trainer.protocol.remaining_cost) as logger:
             finished = trainer.train(logger, interrupt)
