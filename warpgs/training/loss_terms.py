@@ -79,21 +79,9 @@ def scale(inputs: LossInputs) -> Float[Tensor, ""]:
 
 
 TERMS: dict[str, LossTerm] = {
-    "static": LossTerm(
-        static,
-        is_active=lambda phase, config: phase.with_branches,
-        weight=lambda plan, config: 1.0,
-    ),
-    "dynamic": LossTerm(
-        dynamic,
-        is_active=lambda phase, config: phase.stage != "pretrain" and phase.with_branches,
-        weight=lambda plan, config: 1.0,
-    ),
-    "joint": LossTerm(
-        joint,
-        is_active=lambda phase, config: phase.with_joint,
-        weight=lambda plan, config: 1.0,
-    ),
+    "static": LossTerm(static, is_active=lambda phase, config: phase.with_branches),
+    "dynamic": LossTerm(dynamic, is_active=lambda phase, config: phase.stage != "pretrain" and phase.with_branches),
+    "joint": LossTerm(joint, is_active=lambda phase, config: phase.with_joint),
     "squared": LossTerm(
         squared,
         is_active=lambda phase, config: phase.with_joint and config.squared > 0,

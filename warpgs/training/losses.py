@@ -51,12 +51,12 @@ class LossTerm(NamedTuple):
         compute: The term without its weight. It may branch on ``LossInputs.config`` and on nothing that changes during
             a run, and must not read values back from the device: on CUDA it is captured in a graph.
         is_active: Whether the term is computed in a phase.
-        weight: The weight in an iteration.
+        weight: The weight in an iteration; always 1 by default.
     """
 
     compute: Callable[[LossInputs], Float[Tensor, ""]]
     is_active: Callable[[Phase, LossConfig], bool]
-    weight: Callable[[IterationPlan, LossConfig], float]
+    weight: Callable[[IterationPlan, LossConfig], float] = lambda plan, config: 1.0
 
 
 def image_loss(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], ssim_weight: float) -> Float[Tensor, ""]:

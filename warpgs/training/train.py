@@ -201,11 +201,8 @@ def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitSta
     """The trainer of a new run."""
     asked = config
     config = scaled(dataclasses.replace(config, device=_own_device(config.device)))
-    _check_precision(config)
-    locate(config.lpips, config.lpips_net)  # reports a wrong folder now, not after training
-    capture = open_capture(config, quiet)
-    require_fit(capture.assuming(config.assume), log)
-    _compare_ranks(config, capture)
+    _require_usable(config)
+    capture = _checked(open_capture(config, quiet), config, log)
     folder = str(locks.enter_context(locked_new_folder(config, capture))) if ranks.is_first() else ""
     _read_evaluation_frames(capture, config, quiet)
     if config.device == "cpu" and config.preset in ("best", "paper"):
@@ -221,10 +218,11 @@ def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitSta
     return trainer
 
 
-def _check_precision(config: TrainConfig) -> None:
-    """Raises ValueError if the networks would be trained in half precision where that may be wrong."""
+def _require_usable(config: TrainConfig) -> None:
+    """Raises ValueError if half precision may be wrong, or, now and not after training, for a wrong folder of LPIPS."""
     if config.model.half and config.device == "cuda":
         check_half_precision()
+    locate(config.lpips, config.lpips_net)
 
 
 def _cpu_advice(config: TrainConfig) -> str:
@@ -245,18 +243,12 @@ def _continued(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.Exi
     if ranks.is_first():
         locks.enter_context(found.lock())
     saved = extended(read_config(folder), config.iterations)
-    if config.data is not None:
-        saved = dataclasses.replace(saved, data=config.data)
+    given = {name: getattr(config, name) for name in ("data", "lpips", "as_taken") if getattr(config, name)}
     if config.lpips is not None:
-        saved = dataclasses.replace(saved, lpips=config.lpips, lpips_net=config.lpips_net)
-    if config.as_taken:
-        saved = dataclasses.replace(saved, as_taken=True)
-    run = Run(folder, dataclasses.replace(saved, device=_own_device(config.device or saved.device)))
-    _check_precision(run.config)
-    locate(run.config.lpips, run.config.lpips_net)
-    capture = run.open_capture(quiet)
-    require_fit(capture.assuming(run.config.assume), log)
-    _compare_ranks(run.config, capture)
+        given["lpips_net"] = config.lpips_net
+    run = Run(folder, dataclasses.replace(saved, **given, device=_own_device(config.device or saved.device)))
+    _require_usable(run.config)
+    capture = _checked(run.open_capture(quiet), run.config, log)
     _read_evaluation_frames(capture, run.config, quiet)
     trainer = Trainer(prepare_again(run.config, capture), run.folder)
     trainer.restore_newest(log)
@@ -272,15 +264,17 @@ def _own_device(asked: Device | None) -> Device:
     return device
 
 
-def _compare_ranks(config: TrainConfig, capture: Capture) -> None:
-    """Raises ValueError if a rank of torchrun was started with other options or has another capture than the first."""
+def _checked(capture: Capture, config: TrainConfig, log: Log) -> Capture:
+    """The capture, if it is fit to train on and the same on all ranks of torchrun, as the options are."""
+    require_fit(capture.assuming(config.assume), log)
     if ranks.num_ranks() == 1:
-        return
+        return capture
     ranks.require_same("the options", json.dumps(dataclasses.asdict(config), default=str).encode())
     cameras = [(name, camera.size, camera.time) for name, camera in sorted(capture.cameras.items())]
     values = [capture.points, *(tensor for _, c in sorted(capture.cameras.items()) for tensor in (c.viewmat, c.K))]
     numbers = b"".join(tensor.cpu().numpy().tobytes() for tensor in values)
     ranks.require_same("the capture", repr((cameras, capture.train, capture.val)).encode() + numbers)
+    return capture
 
 
 def _read_evaluation_frames(capture: Capture, config: TrainConfig, quiet: bool) -> None:
