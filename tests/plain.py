@@ -8,6 +8,7 @@ from functools import partial
 
 from warpgs.config import Plan, TrainConfig
 from warpgs.config.presets import PAPER
+from warpgs.training.schedule import Phase
 
 model = partial(
     replace,
@@ -43,6 +44,20 @@ config = partial(
         optim=optim(),
         densify=densify(),
         schedule=schedule(),
+    ),
+)
+phase = partial(
+    replace,
+    Phase(
+        "stage1",
+        use_deformation=True,
+        use_appearance=True,
+        sh_degree=1,
+        with_depth=False,
+        with_branches=True,
+        with_joint=True,
+        use_dropout=False,
+        densifies=False,
     ),
 )
 

@@ -7,7 +7,7 @@ import inspect
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from warpgs.ops.dropout import MAX_SEED
 from warpgs.runtime import ranks
 from warpgs.training.optimizer import GROUPS
@@ -128,17 +128,7 @@ def test_a_step_does_not_keep_its_plan(data, tmp_path):
 
 @pytest.mark.parametrize("field", [field.name for field in dataclasses.fields(Phase)])
 def test_phases_that_differ_in_one_field_are_different_keys(field):
-    phase = Phase(
-        "stage1",
-        use_deformation=True,
-        use_appearance=True,
-        sh_degree=1,
-        with_depth=True,
-        with_branches=True,
-        with_joint=True,
-        use_dropout=True,
-        densifies=True,
-    )
+    phase = plain.phase(with_depth=True, use_dropout=True, densifies=True)
     other = dataclasses.replace(phase, **{field: "stage2" if field == "stage" else 0})
     assert len({phase, other}) == 2
 

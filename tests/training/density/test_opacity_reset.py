@@ -20,20 +20,9 @@ from warpgs.rendering import opacities_on_screen, render
 from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.opacity_reset import reset_opacities
 from warpgs.training.optimizer import make_optimizer
-from warpgs.training.schedule import Phase
 
 NETWORK = plain.model(position_bands=1, time_bands=1, depth=1, width=2)
-PHASE = Phase(
-    "stage1",
-    use_deformation=True,
-    use_appearance=False,
-    sh_degree=0,
-    with_depth=False,
-    with_branches=True,
-    with_joint=True,
-    use_dropout=False,
-    densifies=False,
-)
+PHASE = plain.phase(use_appearance=False, sh_degree=0)
 ANTIALIAS = RenderSettings(antialias=True)
 FOCAL, DEPTH, SIZE = 100.0, 2.0, (96, 80)
 K = torch.tensor([[FOCAL, 0.0, SIZE[0] / 2], [0.0, FOCAL, SIZE[1] / 2], [0.0, 0.0, 1.0]])

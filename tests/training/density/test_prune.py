@@ -15,7 +15,6 @@ from warpgs.model.scene import SplitScene
 from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.prune import Pruned, blend_weights, prune_invisible, remove_weakest, visibility
 from warpgs.training.optimizer import make_optimizer
-from warpgs.training.schedule import Phase
 
 NETWORK = plain.model(position_bands=1, time_bands=1, depth=1, width=2)
 AHEAD = make_camera()
@@ -199,18 +198,7 @@ def test_blend_weights_are_summed_over_the_joint_images_of_all_views(data, tmp_p
         with torch.no_grad():
             splats = as_dict(scene.splats(view.time, sh_degree=1))
             expected += reference(splats, view.camera, torch.zeros(3, dtype=torch.float64))[2].sum((1, 2))
-    phase = Phase(
-        "stage2",
-        True,
-        True,
-        1,
-        with_depth=False,
-        with_branches=True,
-        with_joint=True,
-        use_dropout=False,
-        densifies=False,
-    )
-    assert error(blend_weights(scene, views, phase), expected) < 1e-5 * expected.max()
+    assert error(blend_weights(scene, views, plain.phase(stage="stage2")), expected) < 1e-5 * expected.max()
     assert (expected > 0).sum() > len(expected) / 2
 
 

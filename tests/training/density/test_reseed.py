@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import pytest
 import torch
 
-from tests import tiny
+from tests import plain, tiny
 from tests.reference.render import as_dict
 from tests.reference.render import render as reference
 from tests.scenes import error, select
@@ -17,11 +17,8 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.runs.logger import TrainingLogger
 from warpgs.training import optimizer as optim
 from warpgs.training.density.reseed import gaussians_that_show, lost_fraction, lost_pixels, require_branches, reseed
-from warpgs.training.schedule import Phase
 
-PHASE = Phase(
-    "stage1", True, True, 1, with_depth=False, with_branches=True, with_joint=True, use_dropout=False, densifies=False
-)
+PHASE = plain.phase()
 
 
 @pytest.fixture
