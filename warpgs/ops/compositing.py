@@ -12,7 +12,7 @@ from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.constants import TILE_SIZE
 from warpgs.kernels.lanes import BLOCK_DIM, WARP_COLUMNS, WARP_ROWS, WARP_SIZE
 from warpgs.kernels.rows import gradient_stride
-from warpgs.runtime.launch import launch, num_shards
+from warpgs.runtime.launch import is_small, launch, num_shards
 from warpgs.runtime.tape import Gradients
 
 from .rows import Rows
@@ -26,9 +26,6 @@ CUDA_PIXELS = (1, 2)
 
 SMALL_IMAGE_CUDA_PIXELS = (1, 1)
 """``CUDA_PIXELS`` of small images, which would otherwise have too few lanes to keep a GPU busy."""
-
-MAX_SMALL_IMAGE_PIXELS = 1 << 18
-"""Images of at most this number of pixels are small."""
 
 CPU_PIXELS = (TILE_SIZE, TILE_SIZE)
 
@@ -97,11 +94,6 @@ class Traversal(NamedTuple):
     lists: tuple[Tensor, Tensor | None, Tensor, int]
     view: tuple[int, int, int, float]
     state: PixelState
-
-
-def is_small(size: tuple[int, int]) -> bool:
-    """Whether an image of a size (width, height) should be split into smaller pieces on a GPU."""
-    return size[0] * size[1] <= MAX_SMALL_IMAGE_PIXELS
 
 
 def _layout(size: tuple[int, int], tiles: Tiles) -> tuple[tuple[int, int], int, int]:

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from warpgs.kernels import ssim as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
-from warpgs.runtime.launch import launch
+from warpgs.runtime.launch import is_small, launch
 from warpgs.runtime.tape import Gradients, Recorded, differentiable
 
 from . import ssim_cpu
-from .compositing import is_small
 
 
 class Weights(NamedTuple):

@@ -31,6 +31,9 @@ MIN_SHARD = 16384
 LITTLE_WORK = 1 / 16
 """Work of a thread that only copies a few numbers, relative to a plain thread."""
 
+MAX_SMALL_IMAGE_PIXELS = 1 << 18
+"""Images of at most this number of pixels are small."""
+
 CPU = -1
 """Index of the CPU among devices (``Tensor.get_device()``, which the host obtains faster than ``Tensor.device``)."""
 
@@ -40,6 +43,11 @@ _CORES = os.cpu_count() or 1
 def num_shards(tensor: Tensor) -> int:
     """Number of cores that a launch uses on the device of a tensor: ``torch.get_num_threads()`` on CPU, 1 on CUDA."""
     return 1 if tensor.is_cuda else _num_cores()
+
+
+def is_small(size: tuple[int, int]) -> bool:
+    """Whether an image of a size (width, height) should be split into smaller pieces on a GPU, to keep it busy."""
+    return size[0] * size[1] <= MAX_SMALL_IMAGE_PIXELS
 
 
 def _num_cores() -> int:
