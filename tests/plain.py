@@ -19,11 +19,9 @@ model = partial(
         sh_degree=1,
         appearance_degree=0,
         appearance_opacity=False,
-        point_colors="capture",
-        bound_sizes=True,
+        start="frames",
         dynamic_points=20_000,
         tracks=True,
-        dynamic_start="points",
     ),
 )
 loss = partial(replace, replace(PAPER.loss, depth=2.0, depth_dynamic=1.0, depth_end=0.2, depth_gate=True))

@@ -27,8 +27,7 @@ NETWORK = plain.model(
     position_bands=1, time_bands=1, depth=1, width=2, max_static_points=20, dynamic_points=30
 )  # networks do not matter here
 CONFIG = plain.config(model=NETWORK)
-GREY = plain.config(model=dataclasses.replace(NETWORK, point_colors="grey"))
-UNBOUNDED = plain.config(model=dataclasses.replace(NETWORK, bound_sizes=False))
+PLAIN = plain.config(model=dataclasses.replace(NETWORK, start="plain"))
 DEPTH = 2.5
 BLOCK = (slice(10, 20), slice(15, 35))
 """The dynamic region: 200 pixels."""
@@ -123,7 +122,7 @@ def merged(points, copies, jitter=0.0):
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-7])
 @pytest.mark.parametrize("copies", [2, 4, 30])
-@pytest.mark.parametrize("model", [NETWORK, UNBOUNDED.model])
+@pytest.mark.parametrize("model", [NETWORK, PLAIN.model])
 def test_points_that_occur_several_times_have_the_size_of_single_ones(copies, jitter, model):
     points = 5.0 + random_points(50)
     repeated, original = merged(points, copies, jitter)
@@ -151,7 +150,7 @@ def test_the_resolution_changes_no_sizes_of_points_that_are_farther_apart():
 
 def test_sizes_without_bounds_have_no_resolution():
     points = random_points(40)
-    model = UNBOUNDED.model
+    model = PLAIN.model
     plain, resolved = (gaussians_at(points, torch.rand(40, 3), model, resolution=r).scales for r in (0.0, 1.0))
     assert torch.equal(plain, resolved)
 
@@ -216,7 +215,7 @@ def test_sizes_without_bounds_are_those_of_3dgs():
     expected = squared.clamp_min(1e-7).sqrt()
     assert expected.max() > 999
     assert expected[-4:].tolist() == [1e-7**0.5] * 4
-    gaussians = gaussians_at(points, torch.rand(32, 3), UNBOUNDED.model, max_scale=0.5)
+    gaussians = gaussians_at(points, torch.rand(32, 3), PLAIN.model, max_scale=0.5)
     assert (gaussians.scales.detach() / expected[:, None] - 1).abs().max() < 1e-5
 
 
@@ -241,8 +240,8 @@ def test_initial_colours_can_be_those_of_deformable_3dgs(assumption, has_colors)
     points = random_points(9)
     colors = torch.randint(0, 256, (9, 3), generator=generator(), dtype=torch.uint8) if has_colors else None
     capture = make_capture(points, colors).assuming(assumption)
-    static = initial_scene(GREY, capture).static
-    gaussians = dynamic_gaussians(capture, ALIGNMENT, GREY) if assumption == "dynamic" else static
+    static = initial_scene(PLAIN, capture).static
+    gaussians = dynamic_gaussians(capture, ALIGNMENT, PLAIN) if assumption == "dynamic" else static
     assert torch.equal(gaussians.means, points)
     assert gaussians.sh_dc.min() >= -1e-7
     assert 1 / 510 < gaussians.sh_dc.max() <= 1 / 255
@@ -437,7 +436,7 @@ def test_without_depth_dynamic_gaussians_start_in_front_of_the_points_around_the
 @pytest.mark.parametrize("inverse_depth", [None, mostly_unknown()])
 def test_without_depth_dynamic_gaussians_can_start_uniformly_in_the_box(inverse_depth):
     points = random_points(300)
-    model = dataclasses.replace(NETWORK, dynamic_start="uniform", dynamic_points=2_000)
+    model = dataclasses.replace(NETWORK, start="plain", dynamic_points=2_000)
     config = dataclasses.replace(CONFIG, model=model)
     gaussians = dynamic_gaussians(make_capture(points, inverse_depth=inverse_depth), ALIGNMENT, config)
     center, half_size = scene_box(points)
@@ -450,7 +449,7 @@ def test_without_depth_dynamic_gaussians_can_start_uniformly_in_the_box(inverse_
 
 
 def test_with_depth_dynamic_gaussians_start_at_it_even_if_they_would_be_uniform_without():
-    config = dataclasses.replace(CONFIG, model=dataclasses.replace(NETWORK, dynamic_start="uniform"))
+    config = dataclasses.replace(CONFIG, model=dataclasses.replace(NETWORK, start="plain"))
     gaussians = dynamic_gaussians(make_capture(random_points(9), inverse_depth=constant_depth()), ALIGNMENT, config)
     depth = CAMERA.project(gaussians.means.detach())[2]
     assert error(depth, torch.full_like(depth, DEPTH)) < 5e-3
@@ -585,7 +584,7 @@ def test_if_masks_mark_nothing_as_dynamic_there_are_no_dynamic_gaussians():
     assert len(dynamic_gaussians(with_frames(capture, read), ALIGNMENT)) == 0
 
 
-@pytest.mark.parametrize(("config", "is_bounded"), [(CONFIG, True), (UNBOUNDED, False)])
+@pytest.mark.parametrize(("config", "is_bounded"), [(CONFIG, True), (PLAIN, False)])
 def test_gaussians_of_unknown_depth_are_small_unless_sizes_are_unbounded(config, is_bounded):
     capture = make_capture(100.0 * random_points(50))
     max_scale = dynamic_gaussians(capture, ALIGNMENT, config).scales.max()

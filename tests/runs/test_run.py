@@ -184,6 +184,16 @@ def test_captures_of_two_cameras_had_a_factor_of_their_own(run, tmp_path, before
     assert read_config(run).factor == (factor if val == ["right"] else None)
 
 
+@pytest.mark.parametrize(("before", "start"), [(None, "frames"), ("points", "frames"), ("uniform", "plain")])
+def test_where_dynamic_gaussians_start_was_an_option_of_its_own(run, before, start):
+    def change(values):
+        del values["model"]["start"]
+        values["model"] |= {} if before is None else {"dynamic_start": before}
+
+    edit(run, change)
+    assert read_config(run).model.start == start
+
+
 @pytest.mark.parametrize(
     ("before", "damage"),
     [

@@ -43,13 +43,12 @@ class ModelConfig:
     fit of the deformation to points is always in single precision."""
     max_static_points: int = 100_000
     """Maximum number of initial static Gaussians."""
-    point_colors: Literal["capture", "grey"] = "capture"
-    """Initial colours of Gaussians at the sparse points: those of the points, or without any the mean of the pixels
-    that show them (capture), or mid-grey within 0.0011, as Deformable-3DGS starts captures in the layouts of NeRF-DS
-    and HyperNeRF (grey)."""
-    bound_sizes: bool = True
-    """Whether initial sizes, which are distances to neighbours, are between 1/1000 and 10 times their median, and those
-    of dynamic Gaussians of unknown depth under 1.9 % of the view size; 3DGS has no such bounds."""
+    start: Literal["frames", "plain"] = "frames"
+    """How Gaussians start. Frames: in the colours of the sparse points, or of the pixels that show them; with sizes,
+    which are distances to neighbours, between 1/1000 and 10 times their median; dynamic ones of unknown depth in front
+    of the points around them, under 1.9 % of the view size. Plain (paper, which names no start): mid-grey within
+    0.0011, as Deformable-3DGS on captures in the layouts of NeRF-DS and HyperNeRF; with any size, as in 3DGS; dynamic
+    ones of unknown depth uniformly in the scene's box, as in the code of the paper's authors."""
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
     dropout: Annotated[float, Bounds(max=0.9)] = 0.1
@@ -57,6 +56,3 @@ class ModelConfig:
     others are divided by one minus it, so that none relies on a few others (DropGaussian). 0: none (paper)."""
     tracks: bool = True
     """Whether small objects that move far between frames start on tracks (docs/design/tracks.md)."""
-    dynamic_start: Literal["points", "uniform"] = "points"
-    """Where dynamic Gaussians start if their depth is unknown: in front of the sparse points around them, or uniformly
-    in the scene's box, as in the code of the paper's authors; the paper names no start."""

@@ -29,12 +29,10 @@ PAPER = replace(
         skip=5,
         appearance_degree=3,
         appearance_opacity=True,
-        point_colors="grey",
-        bound_sizes=False,
+        start="plain",
         dynamic_points=100_000,
         dropout=0.0,
         tracks=False,
-        dynamic_start="uniform",
     ),
     loss=replace(
         BEST.loss,

@@ -61,13 +61,13 @@ def _gaussians_at_points(config: TrainConfig, capture: Capture, views: Views, ge
 def _colored_points(
     config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """A random subset of the capture's points with colours in [0, 1]; see ``model.point_colors``."""
+    """A random subset of the capture's points with colours in [0, 1]; see ``model.start``."""
     points, colors, max_count = capture.points, capture.point_colors, config.model.max_static_points
     if len(points) == 0:
         points, colors = random_points(points, max_count, generator), None
     chosen = subsample(points, max_count, generator)
     points = points[chosen]
-    if config.model.point_colors == "grey":
+    if config.model.start == "plain":
         return points, 0.5 + SH_C0 / 255.0 * torch.rand(points.shape, dtype=torch.float32, generator=generator)
     if colors is not None:
         return points, colors[chosen].float() / 255.0
@@ -110,7 +110,7 @@ def dynamic_gaussians(
 ) -> DynamicStart | None:
     """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation may be fitted first.
 
-    Without depth they start in front of the points around them, or, as ``model.dynamic_start`` says and without visible
+    Without depth they start in front of the points around them, or, as ``model.start`` says and without visible
     points, at random positions in the scene's box. If everything is assumed to be dynamic, they start at the sparse
     points. If nothing is dynamic, there are none. What was tracked starts on its tracks. The deformation is fitted
     unless ``schedule.fit_motion`` is 0, as in plans where it cannot be. The result is None, and the deformation as it
@@ -138,10 +138,10 @@ def dynamic_gaussians(
 def _gaussians_at_dynamic_points(
     config: TrainConfig, capture: Capture, found: DynamicPoints, generator: torch.Generator
 ) -> Gaussians:
-    """Gaussians at a random subset of points; in the scene's box if ``model.dynamic_start`` says so or none is left."""
+    """Gaussians at a random subset of points; in the scene's box if ``model.start`` says so or none is left."""
     max_count = config.model.dynamic_points
     found = found.chosen(subsample(found.positions, max_count, generator))
-    is_uniform = config.model.dynamic_start == "uniform" and not found.depth_known
+    is_uniform = config.model.start == "plain" and not found.depth_known
     if is_uniform or len(found.positions) == 0:
         return gaussians_in_box(capture, max_count, config, generator)
     largest = math.inf if found.depth_known else MAX_SCALE * capture.view_size

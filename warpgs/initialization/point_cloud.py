@@ -50,12 +50,12 @@ def gaussians_at(
     Args:
         points: [N, 3] positions on the CPU.
         colors: [N, 3] in [0, 1].
-        model: Degree of spherical harmonics, and whether sizes are bounded.
+        model: Degree of spherical harmonics, and whether sizes are bounded (``start``).
         max_scale: Maximum standard deviation, if sizes are bounded [scene units].
         resolution: What cameras resolve, if sizes are bounded: closer points are at one place, and no Gaussian is
             smaller [scene units].
     """
-    first, place = distinct(points, resolution if model.bound_sizes else 0.0)
+    first, place = distinct(points, 0.0 if model.start == "plain" else resolution)
     if len(first) <= NUM_NEIGHBOURS:
         scale = 0.5 * max_scale if math.isfinite(max_scale) else FEW_POINTS_SCALE
         scales = torch.full((points.shape[0],), scale, dtype=torch.float32)
@@ -63,7 +63,7 @@ def gaussians_at(
     places = points[first].numpy()
     distances, _ = cKDTree(places).query(places, k=NUM_NEIGHBOURS + 1, workers=-1)
     scales = torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(1))).float()
-    if model.bound_sizes:
+    if model.start != "plain":
         # Of points that nearly coincide and of a few distant ones, distances are no sizes.
         typical = scales.median().clamp_min(1e-7)
         scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_min(resolution).clamp_max(max_scale)

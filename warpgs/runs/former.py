@@ -55,8 +55,11 @@ REMOVED: dict[str, Removed] = {
     "loss.joint": _always(1.0),
     "loss.mask_tolerance": Removed(),
     "loss.static": _always(1.0),
+    "model.bound_sizes": Removed("--model.start has it"),
+    "model.dynamic_start": Removed("--model.start has it"),
     "model.path_points": Removed(),
     "model.paths": Removed(),
+    "model.point_colors": Removed("--model.start has it"),
     "optim.opacities": _always(0.05),
     "optim.quats": _always(1e-3),
     "optim.scales": _always(5e-3),
@@ -117,12 +120,9 @@ FORMER: dict[str, dict[str, Any]] = {
     "model": {
         "appearance_depth": None,
         "appearance_width": None,
-        "bound_sizes": True,
         "deformation": "mlp",
         "dropout": 0.0,
-        "dynamic_start": "points",
         "min_period": 0.0,
-        "point_colors": "capture",
         "raw_input": True,
         "tracks": True,
     },
@@ -213,11 +213,17 @@ def _factor(values: dict[str, Any]) -> None:
         values["factor"] = values["vrig_factor"] or 2
 
 
+def _start(values: dict[str, Any]) -> None:
+    """Colours, sizes and places at which Gaussians start were options of their own, of which paper 0.3 had the last."""
+    if isinstance(model := values.get("model"), dict):
+        model.setdefault("start", "plain" if model.get("dynamic_start") == "uniform" else "frames")
+
+
 def _masks(values: dict[str, Any]) -> None:
     """Damage to masks was a section of three numbers."""
     if isinstance(masks := values.get("masks"), dict):
         values.setdefault("damage_masks", ",".join(f"{kind}:{size}" for kind, size in masks.items() if size) or None)
 
 
-CHANGES = (_looked_up, _losses, _switches, _factor, _masks)
+CHANGES = (_looked_up, _losses, _switches, _factor, _start, _masks)
 """What was written otherwise; each changes the values in place."""
