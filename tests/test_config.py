@@ -59,11 +59,17 @@ def test_a_number_out_of_its_range_is_refused_by_name(name, value):
         scaled(changed(name, value))
 
 
-@pytest.mark.parametrize(("degree", "appearance_degree"), [(4, 0), (1, 2)])
-def test_inconsistent_sh_degrees_are_refused(degree, appearance_degree):
-    config = changed("model.sh_degree", degree)
-    with pytest.raises(ValueError, match=r"appearance_degree <= model\.sh_degree <= 3"):
-        validate(changed("model.appearance_degree", appearance_degree, config))
+def test_an_sh_degree_above_3_is_refused():
+    with pytest.raises(ValueError, match=r"expected model\.sh_degree <= 3, got 4"):
+        validate(changed("model.sh_degree", 4))
+
+
+@pytest.mark.parametrize("size", [(0, 128), (4, 0), (65, 128), (4, 4097)])
+def test_a_size_of_the_appearance_network_that_cannot_be_is_refused(size):
+    with pytest.raises(
+        ValueError, match=r"each number of model\.appearance_size must be a number of at (least 1|most)"
+    ):
+        validate(changed("model.appearance_size", size))
 
 
 @pytest.mark.parametrize("bands", ["position_bands", "time_bands"])

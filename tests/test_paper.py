@@ -24,8 +24,7 @@ PAPER = {
     },
     "Visual Geometry Decomposition: Eq. 8 and 9, static component": {
         "model.sh_degree": 3,
-        "model.appearance_degree": 3,
-        "model.appearance_opacity": True,
+        "model.appearance": "all",
         "frozen": "all",
         "loss.ssim": 0.2,
     },
@@ -55,8 +54,7 @@ PAPER = {
         "optim.networks": 8e-4,
         "optim.networks_end": 1.6e-6,
         "schedule.warmup": 0,
-        "model.appearance_depth": None,
-        "model.appearance_width": None,
+        "model.appearance_size": None,
     },
     "Deformable-3DGS: network": {"model.depth": 8, "model.width": 256, "model.skip": 5},
     "Deformable-3DGS: optimization": {

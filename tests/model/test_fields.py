@@ -25,7 +25,7 @@ SHAPES = [(8, 4), (3, 2), (3, 1), (1, 4), (4, 4)]
 
 
 def model(**changes):
-    sizes = {"position_bands": 3, "time_bands": 2, "width": 16, "sh_degree": 3, "appearance_opacity": True}
+    sizes = {"position_bands": 3, "time_bands": 2, "width": 16, "sh_degree": 3, "appearance": "all"}
     return plain.model(**{**sizes, **changes})
 
 
@@ -199,16 +199,17 @@ def test_offsets_of_positions_are_multiples_of_the_length_that_counts_as_1():
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_the_appearance_has_a_residual_of_every_coefficient_up_to_its_degree(degree):
-    residuals, logits = make_field(AppearanceField, appearance_degree=degree)(random_means(), TIME)
+def test_the_appearance_has_a_residual_of_every_coefficient_up_to_the_degree(degree):
+    residuals, logits = make_field(AppearanceField, sh_degree=degree)(random_means(), TIME)
     assert residuals.shape == (9, (degree + 1) ** 2, 3)
     assert logits.shape == (9,)
     together = torch.cat([residuals.flatten(1), logits[:, None]], 1)
     assert len(together.unique(dim=1).T) == 3 * (degree + 1) ** 2 + 1
 
 
-def test_without_appearance_opacity_there_are_no_residuals_of_opacities():
-    residuals, logits = make_field(AppearanceField, appearance_opacity=False)(random_means(), TIME)
+def test_where_colours_alone_change_there_is_one_residual_of_each_and_none_of_opacities():
+    residuals, logits = make_field(AppearanceField, appearance="color")(random_means(), TIME)
+    assert residuals.shape == (9, 1, 3)
     assert logits is None
     assert residuals.all()
 

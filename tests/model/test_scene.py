@@ -69,7 +69,7 @@ def test_is_dynamic_marks_the_branch_of_each_gaussian():
 
 @pytest.mark.parametrize(("part", "changing"), [(static_part, {"sh", "opacities"}), (dynamic_part, set(GEOMETRY))])
 def test_time_changes_the_appearance_of_static_gaussians_and_the_geometry_of_dynamic_ones(part, changing):
-    scene = make_scene(appearance_opacity=True)
+    scene = make_scene(appearance="all")
     assert differing(part(scene.splats(TIME)), part(scene.splats(LATER))) == changing
 
 
@@ -93,12 +93,11 @@ def test_the_static_gaussians_alone_have_their_own_appearance():
         assert error(getattr(alone, name), whole[name]) < 1e-6
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_residuals_are_added_to_the_coefficients_of_the_lowest_degrees(degree):
+@pytest.mark.parametrize(("appearance", "bases"), [("color", 1), ("all", 16)])
+def test_residuals_are_added_to_the_coefficients_of_the_lowest_degrees(appearance, bases):
     """Eq. 8 of the paper."""
-    scene = make_scene(appearance_degree=degree)
+    scene = make_scene(appearance=appearance)
     residual, _ = scene.appearance(scene.static.means, TIME)
-    bases = (degree + 1) ** 2
     sh = static_part(scene.splats(TIME))["sh"].detach()
     assert residual.all()
     assert error(sh[:, :bases], scene.static.sh[:, :bases].double() + residual.double()) < 1e-6
@@ -106,7 +105,7 @@ def test_residuals_are_added_to_the_coefficients_of_the_lowest_degrees(degree):
 
 
 def test_residuals_of_opacity_are_added_to_its_logit():
-    scene = make_scene(appearance_opacity=True)
+    scene = make_scene(appearance="all")
     _, residual = scene.appearance(scene.static.means, TIME)
     logits = scene.static.logit_opacities.double() + residual.double()
     assert residual.all()
@@ -114,20 +113,20 @@ def test_residuals_of_opacity_are_added_to_its_logit():
 
 
 def test_opacities_stay_within_zero_and_one_whatever_their_residuals():
-    scene = make_scene(appearance_opacity=True)
+    scene = make_scene(appearance="all")
     for bias in (-1e6, 1e6):
         scene.appearance.trunk.layers(scene.appearance.trunk.values.data)[-1].bias.fill_(bias)
         opacities = static_part(scene.splats(TIME))["opacities"]
         assert ((opacities >= 0) & (opacities <= 1)).all()
 
 
-def test_opacities_are_constant_without_appearance_opacity():
-    splats = static_part(make_scene(appearance_opacity=False).splats(TIME))
+def test_opacities_are_constant_where_the_network_changes_colours_alone():
+    splats = static_part(make_scene(appearance="color").splats(TIME))
     assert torch.equal(splats["opacities"], make_scene().static.opacities)
 
 
 def test_the_appearance_network_gets_no_gradient_from_hidden_gaussians():
-    scene, is_hidden = make_scene(appearance_opacity=True), torch.arange(NUM_STATIC) < 3
+    scene, is_hidden = make_scene(appearance="all"), torch.arange(NUM_STATIC) < 3
     splats = scene.splats(TIME, is_hidden=is_hidden)
     assert not differing(static_part(splats), static_part(scene.splats(TIME)))
     weights = scene.appearance.trunk.values
@@ -139,15 +138,15 @@ def test_the_appearance_network_gets_no_gradient_from_hidden_gaussians():
 
 
 def test_without_use_appearance_the_appearance_network_does_not_matter():
-    scene, plain = make_scene(appearance_opacity=True), make_scene(trained=False)
+    scene, plain = make_scene(appearance="all"), make_scene(trained=False)
     assert not differing(
         static_part(scene.splats(TIME, use_appearance=False)), static_part(plain.splats(TIME, use_appearance=False))
     )
 
 
-@pytest.mark.parametrize("appearance_opacity", [False, True])
-def test_an_untrained_appearance_network_leaves_the_images_unchanged(appearance_opacity):
-    scene = make_scene(trained=False, appearance_opacity=appearance_opacity, appearance_degree=3)
+@pytest.mark.parametrize("appearance", ["color", "all"])
+def test_an_untrained_appearance_network_leaves_the_images_unchanged(appearance):
+    scene = make_scene(trained=False, appearance=appearance)
     settings = RenderSettings(branches=True)
     before, after = (
         render(scene.splats(TIME, use_appearance=r), make_camera(), settings=settings) for r in (False, True)
@@ -199,13 +198,13 @@ def test_noise_on_time_deforms_dynamic_gaussians_as_another_time_does():
 
 
 def test_noise_on_time_leaves_static_gaussians_unchanged():
-    scene = make_scene(appearance_opacity=True)
+    scene = make_scene(appearance="all")
     noisy, plain = scene.splats(TIME, time_noise=LATER - TIME), scene.splats(TIME)
     assert not differing(static_part(noisy), static_part(plain))
 
 
 def test_no_gradient_flows_to_positions_through_the_networks():
-    scene = make_scene(appearance_opacity=True, appearance_degree=3)
+    scene = make_scene(appearance="all")
     splats = scene.splats(TIME)
     values = [splats.quats, splats.scales, splats.opacities, splats.sh]
     sum(value.sum() for value in values).backward()
@@ -231,7 +230,7 @@ def test_an_empty_scene_loads_the_state_of_another():
 
 def test_the_appearance_network_has_the_size_of_both_networks_unless_it_has_its_own():
     assert make_scene().appearance.trunk.sizes[:-1] == make_scene().deformation.trunk.sizes[:-1]
-    scene = make_scene(appearance_depth=2, appearance_width=16)
+    scene = make_scene(appearance_size=(2, 16))
     assert [rows for rows, _ in scene.appearance.trunk.sizes] == [16, 16, 3]
     assert [rows for rows, _ in scene.deformation.trunk.sizes] == [8, 8, 8, 10]
 

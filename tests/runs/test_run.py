@@ -184,6 +184,35 @@ def test_captures_of_two_cameras_had_a_factor_of_their_own(run, tmp_path, before
     assert read_config(run).factor == (factor if val == ["right"] else None)
 
 
+@pytest.mark.parametrize(
+    ("depth", "width", "size"), [(None, None, None), (4, 128, (4, 128)), (None, 9, (2, 9)), (5, None, (5, 8))]
+)
+def test_sizes_of_the_appearance_network_were_two_options(run, depth, width, size):
+    def change(values):
+        del values["model"]["appearance_size"]
+        values["model"] |= {"depth": 2, "width": 8, "appearance_depth": depth, "appearance_width": width}
+
+    edit(run, change)
+    assert read_config(run).model.appearance_size == size
+
+
+@pytest.mark.parametrize(
+    ("degree", "opacity", "appearance"), [(0, False, "color"), (1, True, "all"), (0, True, None), (1, False, None)]
+)
+def test_what_the_appearance_network_changes_was_two_options(run, degree, opacity, appearance):
+    def change(values):
+        del values["model"]["appearance"]
+        values["model"] |= {"appearance_degree": degree, "appearance_opacity": opacity}
+
+    assert read_config(run).model.sh_degree == 1
+    edit(run, change)
+    if appearance is None:
+        with pytest.raises(ValueError, match=rf"config\.json: its appearance network changes degrees up to {degree} "):
+            read_config(run)
+    else:
+        assert read_config(run).model.appearance == appearance
+
+
 @pytest.mark.parametrize(("before", "start"), [(None, "frames"), ("points", "frames"), ("uniform", "plain")])
 def test_where_dynamic_gaussians_start_was_an_option_of_its_own(run, before, start):
     def change(values):
@@ -326,8 +355,7 @@ FIRST = {
     "model loss optim densify schedule",
     "densify": "every gradient max_gaussians split_size visibility",
     "loss": "depth depth_dynamic depth_end ssim",
-    "model": "appearance_degree appearance_opacity depth dynamic_points half max_static_points position_bands "
-    "sh_degree skip time_bands width",
+    "model": "depth dynamic_points half max_static_points position_bands sh_degree skip time_bands width",
     "optim": "means networks networks_end sh_dc",
     "schedule": "appearance_from deform_from densify_from densify_until noise_until pretrain prune_every "
     "reset_every sh_degree_every stage1 stage2 warmup",
@@ -351,6 +379,7 @@ def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, 
         values |= {"dap": True, "vdp": True, "app": False, "stage2": True}
         values |= {"static_geometry": False, "static_appearance": False}
         values["masks"] = {"erode": 0, "dilate": 0, "holes": 0.0}
+        values["model"] |= {"appearance_degree": 0, "appearance_opacity": False}
 
     edit(run, reduce)
     densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01)

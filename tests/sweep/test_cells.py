@@ -119,7 +119,7 @@ def test_variants_are_equal_if_they_train_the_same_on_one_capture_whatever_its_n
     ("options", "message"),
     [
         ({"iterations": "many"}, "mine: variant v: iterations cannot be 'many'"),
-        ({"model": {"sh_degree": 4}}, "mine: variant v: expected model.appearance_degree <= model.sh_degree"),
+        ({"model": {"sh_degree": 4}}, "mine: variant v: expected model.sh_degree <= 3, got 4"),
         ({"optim": {"means": "x"}}, "mine: variant v: optim.means cannot be 'x'"),
         ({"densify": {"every": 0}}, "mine: variant v: densify.every must be a number of at least 1"),
     ],

@@ -92,10 +92,10 @@ def test_a_frame_is_captured_on_whatever_thread_plays_it_first(data, tmp_path):
             assert scene.is_captured(seen.size)
 
 
-@pytest.mark.parametrize("opacity", [False, True])
+@pytest.mark.parametrize("appearance", ["color", "all"])
 @pytest.mark.parametrize("captured", [False, True])
-def test_concurrent_networks_compute_the_same_as_one_after_the_other(data, tmp_path, opacity, captured):
-    model = dataclasses.replace(tiny.MODEL, appearance_opacity=opacity)
+def test_concurrent_networks_compute_the_same_as_one_after_the_other(data, tmp_path, appearance, captured):
+    model = dataclasses.replace(tiny.MODEL, appearance=appearance)
     trainer = trainer_on_cuda(data, tmp_path / "run", model=model)
     tiny.train(trainer)
     scene, camera = trainer.scene, trainer.capture.cameras[trainer.capture.train[0]].to("cuda")

@@ -155,7 +155,7 @@ def stopped(data, tmp_path):
 
 def test_a_run_with_the_options_for_captures_resumes_bit_by_bit(data, tmp_path):
     """Margins, trust in depth and exposure are computed anew from the capture."""
-    model, loss = dataclasses.replace(tiny.MODEL, appearance_depth=1, appearance_width=4), PRESETS["best"].loss
+    model, loss = dataclasses.replace(tiny.MODEL, appearance_size=(1, 4)), PRESETS["best"].loss
     densify = dataclasses.replace(tiny.CONFIG.densify, min_pixels=40)
     options = {"antialias": True, "exposure": True, "frozen": "nothing"}
     options["optim"] = dataclasses.replace(tiny.CONFIG.optim, poses=1e-3)

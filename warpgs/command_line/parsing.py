@@ -231,6 +231,8 @@ def _with_help(hint: Any, text: str) -> Any:
 def _metavar(plain: Any) -> str | None:
     if typing.get_origin(plain) is typing.Literal:
         return "{" + ",".join(map(str, typing.get_args(plain))) + "}"
+    if typing.get_origin(plain) is tuple and ... not in typing.get_args(plain):
+        return " ".join(_metavar(part) or "VALUE" for part in typing.get_args(plain))
     return METAVARS.get(plain)
 
 

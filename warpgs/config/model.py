@@ -5,6 +5,9 @@ from typing import Annotated, Literal
 
 from .bounds import Bounds
 
+MAX_DEPTH, MAX_WIDTH = 64, 4096
+"""Maximum numbers of hidden layers of a network, and of units in each of them."""
+
 
 @dataclass(frozen=True)
 class ModelConfig:
@@ -19,25 +22,23 @@ class ModelConfig:
     min_period: float = 4.0
     """Minimum period of the frequencies in the encoding of time [training frames]; higher frequencies overfit and are
     dropped. 0: all are kept (paper)."""
-    depth: Annotated[int, Bounds(min=1, max=64)] = 8
+    depth: Annotated[int, Bounds(min=1, max=MAX_DEPTH)] = 8
     """Number of hidden layers of each network."""
-    width: Annotated[int, Bounds(min=1, max=4096)] = 256
+    width: Annotated[int, Bounds(min=1, max=MAX_WIDTH)] = 256
     """Number of units per hidden layer."""
-    appearance_depth: Annotated[int | None, Bounds(min=1, max=64)] = 4
-    """Number of hidden layers of the appearance network; as ``depth`` if None."""
-    appearance_width: Annotated[int | None, Bounds(min=1, max=4096)] = 128
-    """Number of units per hidden layer of the appearance network; that of both networks if None."""
+    appearance_size: tuple[int, int] | None = (4, 128)
+    """Numbers of hidden layers and of units in each of them of the appearance network; as of the deformation if None
+    (paper)."""
     skip: int = 4
     """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS), unless it is the last one."""
     deformation: str = "mlp"
     """Deformation model, a key of FIELDS in warpgs/model/fields.py; "splines" takes the place of "mlp" on tracks."""
     sh_degree: int = 3
     """Maximum degree of spherical harmonics."""
-    appearance_degree: int = 0
-    """Maximum degree of spherical harmonics that the appearance network changes."""
-    appearance_opacity: bool = False
-    """Whether the appearance network also changes opacities (paper Eq. 8). Off by default: with one camera at a time
-    it fits shadows by fading Gaussians at wrong depths in and out."""
+    appearance: Literal["color", "all"] = "color"
+    """What the appearance network changes of static Gaussians: their colours from all directions alike (color), or all
+    coefficients of spherical harmonics and opacities (all; paper Eq. 8). With one camera at a time that fits shadows by
+    fading Gaussians at wrong depths in and out."""
     half: bool = True
     """On CUDA, multiply the networks' matrices in half precision and sum in single; only if 8 divides ``width``. The
     fit of the deformation to points is always in single precision."""

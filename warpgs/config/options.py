@@ -9,7 +9,7 @@ from .bounds import Bounds, check_bounds
 from .densify import DensifyConfig
 from .loss import LossConfig
 from .masks import MaskPerturbation
-from .model import ModelConfig
+from .model import MAX_DEPTH, MAX_WIDTH, ModelConfig
 from .optim import OptimConfig
 from .render_settings import ALPHA_BOUNDS, RenderSettings
 from .schedule import Schedule
@@ -127,11 +127,10 @@ def validate(config: TrainConfig) -> None:
     """
     check_bounds(config)
     model, schedule = config.model, config.schedule
-    if not model.appearance_degree <= model.sh_degree <= 3:
-        raise ValueError(
-            "expected model.appearance_degree <= model.sh_degree <= 3, "
-            f"got {model.appearance_degree} and {model.sh_degree}"
-        )
+    if model.sh_degree > 3:
+        raise ValueError(f"expected model.sh_degree <= 3, got {model.sh_degree}")
+    for size, most in zip(model.appearance_size or (), (MAX_DEPTH, MAX_WIDTH), strict=False):
+        Bounds(min=1, max=most).check("each number of model.appearance_size", size)
     if not model.raw_input and 0 in (model.position_bands, model.time_bands):
         raise ValueError(
             "without model.raw_input the networks need model.position_bands and model.time_bands of at least 1, "

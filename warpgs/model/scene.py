@@ -21,10 +21,11 @@ class AppearanceField(nn.Module):
 
     def __init__(self, config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> None:
         super().__init__()
-        self.bases = (config.appearance_degree + 1) ** 2
-        depth, width = config.appearance_depth or config.depth, config.appearance_width or config.width
+        changes_all = config.appearance == "all"
+        self.bases = (config.sh_degree + 1) ** 2 if changes_all else 1
+        depth, width = config.appearance_size or (config.depth, config.width)
         config = dataclasses.replace(config, depth=depth, width=width)
-        outputs = (3 * self.bases, 1) if config.appearance_opacity else (3 * self.bases,)
+        outputs = (3 * self.bases, 1) if changes_all else (3 * self.bases,)
         self.trunk = Trunk(config, center, half_size, outputs)
 
     def forward(

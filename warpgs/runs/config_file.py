@@ -81,7 +81,12 @@ def read_config(folder: Path) -> Plan:
         raise ValueError(missing(folder))
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
-    plan: Plan = _parse(Plan, as_today(read_json(path, max_bytes=MAX_BYTES)), path)
+    written = read_json(path, max_bytes=MAX_BYTES)
+    try:
+        values = as_today(written)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    plan: Plan = _parse(Plan, values, path)
     _validate(plan, path)
     return dataclasses.replace(plan, out=folder)
 
@@ -147,7 +152,8 @@ def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
         elif not _matches(value, hint):
             raise ValueError(f"{path}: {prefix}{name} cannot be {reprlib.repr(value)}")
         if isinstance(value, list):
-            value = tuple(item if isinstance(item, str) else float(item) for item in value)
+            is_float = any(float in typing.get_args(part) for part in (hint, *typing.get_args(hint)))
+            value = tuple(map(float, value) if is_float else value)
         fields[name] = float(value) if hint is float else value
     return cls(**fields)
 

@@ -55,6 +55,10 @@ REMOVED: dict[str, Removed] = {
     "loss.joint": _always(1.0),
     "loss.mask_tolerance": Removed(),
     "loss.static": _always(1.0),
+    "model.appearance_degree": Removed("--model.appearance has it"),
+    "model.appearance_depth": Removed("--model.appearance-size has it"),
+    "model.appearance_opacity": Removed("--model.appearance has it"),
+    "model.appearance_width": Removed("--model.appearance-size has it"),
     "model.bound_sizes": Removed("--model.start has it"),
     "model.dynamic_start": Removed("--model.start has it"),
     "model.path_points": Removed(),
@@ -118,8 +122,6 @@ FORMER: dict[str, dict[str, Any]] = {
         "squared": 0.0,
     },
     "model": {
-        "appearance_depth": None,
-        "appearance_width": None,
         "deformation": "mlp",
         "dropout": 0.0,
         "min_period": 0.0,
@@ -213,6 +215,29 @@ def _factor(values: dict[str, Any]) -> None:
         values["factor"] = values["vrig_factor"] or 2
 
 
+def _appearance(values: dict[str, Any]) -> None:
+    """The appearance network had options of its own for its two sizes, and for what it changes.
+
+    Raises:
+        ValueError: If it changes something that today's does not: the checkpoint has a network of another shape.
+    """
+    model = values.get("model")
+    if not isinstance(model, dict) or "depth" not in model or "width" not in model:
+        return
+    size = model.get("appearance_depth"), model.get("appearance_width")
+    model.setdefault("appearance_size", [size[0] or model["depth"], size[1] or model["width"]] if any(size) else None)
+    degree, changes_opacity = model.get("appearance_degree"), model.get("appearance_opacity")
+    if (degree, changes_opacity) == (0, False):
+        model.setdefault("appearance", "color")
+    elif (degree, changes_opacity) == (model.get("sh_degree"), True):
+        model.setdefault("appearance", "all")
+    elif degree is not None and changes_opacity is not None:
+        raise ValueError(
+            f"its appearance network changes degrees up to {degree} of spherical harmonics, and opacities: "
+            f"{changes_opacity}; this version has no such network: open the run with the one that began it"
+        )
+
+
 def _start(values: dict[str, Any]) -> None:
     """Colours, sizes and places at which Gaussians start were options of their own, of which paper 0.3 had the last."""
     if isinstance(model := values.get("model"), dict):
@@ -225,5 +250,5 @@ def _masks(values: dict[str, Any]) -> None:
         values.setdefault("damage_masks", ",".join(f"{kind}:{size}" for kind, size in masks.items() if size) or None)
 
 
-CHANGES = (_looked_up, _losses, _switches, _factor, _start, _masks)
+CHANGES = (_looked_up, _losses, _switches, _factor, _appearance, _start, _masks)
 """What was written otherwise; each changes the values in place."""
