@@ -36,6 +36,13 @@ def test_a_capture_is_shown_in_one_line():
     assert repr(make_capture()[0]) == "<Capture c: 3 frames to train on, 0 to evaluate on, 0 points>"
 
 
+def test_frames_are_sorted_by_their_times_and_names():
+    capture, _ = make_capture()
+    times = {"f0": 0.5, "f1": 0.2, "f2": 0.2}
+    capture = capture.with_cameras({name: dataclasses.replace(camera(0.0), time=time) for name, time in times.items()})
+    assert capture.in_time(("f2", "f0", "f1")) == ["f1", "f2", "f0"]
+
+
 def test_a_frame_is_read_once():
     capture, read = make_capture()
     assert capture.frame("f1") is capture.frame("f1")

@@ -48,7 +48,7 @@ class Sample:
 
     def __init__(self, capture: Capture) -> None:
         self._whole = capture.assuming("masks")
-        names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
+        names = capture.in_time(capture.train)
         largest = max(camera.width * camera.height for camera in capture.cameras.values())
         count = max(MIN_SAMPLES, min(MAX_SAMPLES, MAX_PIXELS // largest))
         self.names, self.pairs = evenly_spaced(names, count), pairs_to_compare(capture, count)

@@ -53,7 +53,7 @@ def import_capture(
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{target} is not an empty folder: choose a new one for the capture")
     capture, renamed = _with_plain_ids(load_capture(source, dataset, factor=factor, cache_frames=2))
-    names = sorted((*capture.train, *capture.val), key=lambda name: (capture.cameras[name].time, name))
+    names = capture.in_time((*capture.train, *capture.val))
     val = list(capture.val) if holdout is None else writer.held_out(names, holdout)
     with complete_or_absent(target) as folder:
         counts = _write_frames(folder, capture, names, quiet=log is None)

@@ -41,7 +41,7 @@ MIN_DIFFERENCE = 0.2
 def pairs_to_compare(capture: Capture, max_count: int) -> list[tuple[str, str]]:
     """Training frames that follow each other in time and look in similar directions, evenly spread over the capture."""
     cameras = capture.cameras
-    names = sorted(capture.train, key=lambda name: cameras[name].time)
+    names = capture.in_time(capture.train)
     pairs = [(a, b) for a, b in itertools.pairwise(names) if are_comparable(cameras[a], cameras[b])]
     return evenly_spaced(pairs, max_count)
 

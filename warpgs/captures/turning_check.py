@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.optical_flow import grey_levels
 from warpgs.data.turning import MIN_MATCHES, Matches, Turning, find_turning
 
 from .findings import Finding
@@ -72,7 +73,7 @@ def turning_of(frames: Sequence[Frame]) -> tuple[Turning, Turning] | None:
 
 def _features(frame: Frame, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
     """Positions [K, 2] and SIFT descriptors [K, 128] of an image's static region."""
-    grey = cv2.resize(cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    grey = grey_levels(frame, size)
     mask = None
     if frame.static_mask is not None:
         mask = cv2.resize(frame.static_mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)

@@ -2,7 +2,7 @@
 
 import copy
 import reprlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, Literal
@@ -287,6 +287,10 @@ class Capture:
         capture.train, capture.val = tuple(train), tuple(val)
         vars(capture).pop("median_depth", None)
         return capture
+
+    def in_time(self, names: Iterable[str]) -> list[str]:
+        """Names of frames in the order of their times; those of the same time in the order of the names."""
+        return sorted(names, key=lambda name: (self.cameras[name].time, name))
 
     def frame(self, name: str) -> Frame:
         """A frame, from the cache if it is among the last ``cache_frames`` read.

@@ -57,7 +57,7 @@ class StartView:
 def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
     """Training cameras, evenly spaced in the order of time; without a capture, default cameras from four sides."""
     if capture is not None:
-        names = sorted(capture.train, key=lambda name: capture.cameras[name].time)
+        names = capture.in_time(capture.train)
         chosen = evenly_spaced_indices(len(names), NUM_SAMPLES)
         return [capture.cameras[names[k]] for k in chosen]
     times = camera_paths.evenly_spaced(NUM_SAMPLES)

@@ -263,7 +263,7 @@ class _Job:
         cameras = self.capture.cameras
         trained = {cameras[name].time for name in self.capture.train}
         names = [*self.capture.train, *(name for name in self.capture.val if cameras[name].time not in trained)]
-        return sorted(names, key=lambda name: (cameras[name].time, name))
+        return self.capture.in_time(names)
 
     def _posed(self, names: list[str], side: int, max_factor: float = np.inf) -> PosedFrames:
         """The frames as one pinhole camera sees them, with the longer side resized to ``side``."""

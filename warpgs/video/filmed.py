@@ -61,7 +61,7 @@ class Filmed:
             clouds: Points of the scene, for cameras that see no points of the capture.
         """
         points = [cloud[:: max(1, len(cloud) // MAX_POINTS)] for cloud in (capture.points, *clouds)]
-        cameras = [capture.cameras[name] for name in sorted(capture.train, key=lambda n: (capture.cameras[n].time, n))]
+        cameras = [capture.cameras[name] for name in capture.in_time(capture.train)]
         seen = Filmed(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
         for k in evenly_spaced_indices(len(cameras), MAX_CAMERAS):
             if seen.outside(*position_and_axis(cameras[k])) > SPACING:

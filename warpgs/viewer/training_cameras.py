@@ -57,10 +57,9 @@ class TrainingCameras:
     """
 
     def __init__(self, capture: Capture, *clouds: Float[Tensor, "_ 3"]) -> None:
-        names = sorted(capture.train, key=lambda name: (capture.cameras[name].time, name))
         self.capture = capture
         self.views = []
-        for name in names:
+        for name in capture.in_time(capture.train):
             camera = capture.cameras[name]
             self.views.append(TrainingCamera(name, pose_of(camera), camera.time, camera.width / camera.height))
         self.path, self.filmed = TrainingPath.of(capture), Filmed.by(capture, *clouds)
