@@ -84,6 +84,11 @@ class Lens:
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         return Lens(*size, (fx, fy), (cx, cy))
 
+    @staticmethod
+    def centered(focal: float, size: tuple[int, int]) -> "Lens":
+        """A pinhole lens with square pixels and its axis in the middle of images of (width, height) [px]."""
+        return Lens(*size, (focal, focal), (size[0] / 2.0, size[1] / 2.0))
+
     def checked(self, undistort: bool = True) -> "Lens":
         """This lens, if it can be used.
 

@@ -80,7 +80,7 @@ def find_turning(pairs: Sequence[Matches], size: tuple[int, int], focal: float |
     tolerance = TOLERANCE * longest
 
     def explained(focal: float, pairs: Sequence[Matches]) -> float:
-        lens = Lens(*size, (focal, focal), (size[0] / 2.0, size[1] / 2.0))
+        lens = Lens.centered(focal, size)
         return float(np.quantile([_explained(pair, lens, tolerance) for pair in pairs], MAX_WORSE_PAIRS))
 
     if focal is None:

@@ -123,7 +123,7 @@ class Steps:
         """The cameras of a tripod: all the same."""
         width, height = self.frames.width, self.frames.height
         focal = self._focal or STILL_FOCAL * max(width, height)
-        lens = self._known_lens or Lens(width, height, (focal, focal), (width / 2.0, height / 2.0))
+        lens = self._known_lens or Lens.centered(focal, (width, height))
         if self._known_lens is None and self._focal is None:
             self.journal.notes.append(f"the focal length is assumed, {focal:.0f} px: frames of a tripod do not tell it")
         poses = np.tile(np.eye(4)[:3], (len(names), 1, 1))

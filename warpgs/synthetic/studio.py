@@ -164,8 +164,7 @@ def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:
 
 
 def _lens(size: StudioSize) -> Lens:
-    focal = 0.82 * size.width
-    return Lens(size.width, size.height, (focal, focal), (0.5 * size.width, 0.5 * size.height))
+    return Lens.centered(0.82 * size.width, (size.width, size.height))
 
 
 def _sixteen_bits(inverse: Float[np.ndarray, "H W"], phase: float) -> np.ndarray:

@@ -139,7 +139,7 @@ def _lens(root: Path, path: Path, size: Float[np.ndarray, "3"]) -> Lens:
         raise ValueError(f"{path} is {width}×{height}, {shape}")
     scale = focal / full_width * width
     try:
-        return Lens(width, height, (scale, scale), (width / 2, height / 2)).checked()
+        return Lens.centered(scale, (width, height)).checked()
     except ValueError as error:
         raise ValueError(f"{root / INDEX}: {error}") from error
 

@@ -101,13 +101,12 @@ def _undistorted(positions: Float[np.ndarray, "M 2"], lens: Lens) -> Float[np.nd
 
 def _find_directions(job: Job, database: Path) -> Cameras:
     """The cameras of a camera that only turns."""
-    matches, (width, height) = verified_matches(database)
+    matches, size = verified_matches(database)
     index = {file: k for k, file in enumerate(job.files)}
     pairs = {(index[a], index[b]): m for (a, b), m in matches.items() if a in index and b in index}
-    focal = job.focal or 1.0  # found unless it is known
-    lens = Lens(width, height, (focal, focal), (width / 2.0, height / 2.0))
+    lens = Lens.centered(job.focal or 1.0, size)  # found unless it is known
     if job.params is not None:
-        lens = lens_of_parameters(job.lens, (width, height), job.params)
+        lens = lens_of_parameters(job.lens, size, job.params)
     finds_distortion = job.params is None and "PINHOLE" not in job.lens
     return find_directions(job.names, pairs, lens, finds_focal=job.finds_focal, finds_distortion=finds_distortion)
 
