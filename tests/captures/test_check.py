@@ -24,7 +24,7 @@ from warpgs.captures.opening import load_capture
 from warpgs.captures.points_check import check_points
 from warpgs.data.depth_alignment import sample_points
 from warpgs.data.dynamic_regions import unknown_depth
-from warpgs.views.stored_views import ViewReader
+from warpgs.views.view_reader import ViewReader
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from warpgs.training.loss_terms import TERMS
 from warpgs.training.losses import LossTerm, dynamic_loss, image_loss, static_loss
 from warpgs.training.schedule import Protocol
 from warpgs.training.step import Sample, Step
-from warpgs.views.stored_views import mask_border
+from warpgs.views.pixels import mask_border
 from warpgs.views.views import Views
 
 HEIGHT, WIDTH = 21, 18

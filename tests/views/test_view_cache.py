@@ -15,7 +15,8 @@ import torch
 from tests import tiny
 from tests.scenes import generator
 from warpgs.captures.opening import load_capture
-from warpgs.views.view_cache import SPARE_BYTES, Pixels, ViewCache
+from warpgs.views.pixels import Pixels
+from warpgs.views.view_cache import SPARE_BYTES, ViewCache
 from warpgs.views.views import Views
 
 SIZES = [(7, 5), (8, 4), (7, 5)]

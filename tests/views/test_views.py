@@ -11,7 +11,7 @@ from tests.data.captures import ids_of, write_capture
 from warpgs.captures.opening import load_capture
 from warpgs.data.capture import Capture
 from warpgs.model.poses import PoseCorrections
-from warpgs.views.stored_views import mask_border
+from warpgs.views.pixels import mask_border
 from warpgs.views.views import Views
 
 CPU = torch.device("cpu")

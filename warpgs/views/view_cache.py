@@ -8,24 +8,14 @@ import weakref
 from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float16, UInt8
-from torch import Tensor
+
+from .pixels import Pixels
 
 SPARE_BYTES = 4 << 30
 """What must stay free on the disk [bytes]."""
-
-
-class Pixels(NamedTuple):
-    """What a view has for each of its pixels; see ``View``."""
-
-    image: UInt8[Tensor, "H W 3"]
-    static_mask: Bool[Tensor, "H W"]
-    inverse_depth: Float16[Tensor, "H W"]
-    mask_border: Bool[Tensor, "H W"] | None
 
 
 def packed_bytes(num_pixels: int) -> int:

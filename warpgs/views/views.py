@@ -17,8 +17,9 @@ from warpgs.data.resized import resize_inverse
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
-from .stored_views import BYTES_PER_PIXEL, Slot, StoredView, ViewReader
+from .pixels import BYTES_PER_PIXEL, Pixels
 from .view_cache import ViewCache
+from .view_reader import Slot, ViewReader
 
 
 class View(NamedTuple):
@@ -86,13 +87,18 @@ class Views:
     ) -> None:
         self.device, self.poses = device, poses
         self._capture, self.background = capture, capture.background
+        cameras = [capture.cameras[name] for name in capture.train]
+        self._viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device)
+        self._Ks = torch.stack([camera.K for camera in cameras]).to(device)
+        self._times = torch.tensor([[camera.time] for camera in cameras], dtype=torch.float32, device=device)
+        self._gains: Float[Tensor, "T 3"] | None = None
         self._reader = ViewReader(capture, mask_margin, pinned=device.type == "cuda")
         # New threads would use the first GPU, whatever the rank.
         setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
         self._read_ahead, self._slot = ReadAhead(self._reader.read, setup), Slot(device)
         self.index = torch.zeros(1, dtype=torch.int64, device=device)
         self.mask_trust = torch.ones(len(capture.train), dtype=torch.float32, device=device)
-        sizes = [capture.cameras[name].size for name in capture.train]
+        sizes = [camera.size for camera in cameras]
         self.num_pixels = sum(width * height for width, height in sizes)
         have_one_size = len(set(sizes)) == 1
         self.uses_graphs = graph and have_one_size and device.type == "cuda"
@@ -102,21 +108,21 @@ class Views:
         first = self._reader.read(0)  # also where none is resident: captures without masks are refused at once
         if self.resident:
             self._all = first.map(lambda tensor: tensor.new_empty((len(self), *tensor.shape), device=device))
-            for index, stored in enumerate(chain([first], self._read_ahead.each(range(1, len(self))))):
-                self._at(index).copy_(stored)
+            for index, pixels in enumerate(chain([first], self._read_ahead.each(range(1, len(self))))):
+                self._at(index).copy_(pixels)
 
     def __len__(self) -> int:
         return len(self._capture.train)
 
     def __getitem__(self, index: int) -> View:
-        on_device = self._stored(index).map(lambda tensor: tensor.to(self.device))
+        on_device = self._pixels(index).map(lambda tensor: tensor.to(self.device))
         return self._view(on_device, torch.full((1,), index, device=self.device))
 
-    def _stored(self, index: int) -> StoredView:
-        """A view on the device if it is resident, else in host memory."""
+    def _pixels(self, index: int) -> Pixels:
+        """The pixels of a view, on the device if they are resident, else in host memory."""
         return self._at(index) if self.resident else self._read_ahead.take(index)
 
-    def _at(self, index: int) -> StoredView:
+    def _at(self, index: int) -> Pixels:
         """The memory of a resident view."""
         return self._all.map(lambda tensors: tensors[index])
 
@@ -156,8 +162,8 @@ class Views:
 
     def frame(self, index: int) -> Frame:
         """The frame of an index, as ``frames`` gives it."""
-        stored = self._stored(index)
-        return Frame(self._capture.train[index], self._camera(index), stored.image.cpu(), stored.static_mask.cpu())
+        pixels = self._pixels(index)
+        return Frame(self._capture.train[index], self._camera(index), pixels.image.cpu(), pixels.static_mask.cpu())
 
     def _camera(self, index: int) -> Camera:
         return self._capture.cameras[self._capture.train[index]]
@@ -176,15 +182,12 @@ class Views:
     def selected(self) -> View:
         """The selected view, read from addresses that stay the same if ``uses_graphs``."""
         if not self.resident:
-            return self._view(self._slot.view, self.index)
+            return self._view(self._slot.pixels, self.index)
         return self._view(self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index)
 
     def divide_by(self, gains: Float[Tensor, "T 3"]) -> None:
         """Divides images by a factor per channel."""
-        self._reader.gains = gains
-        self._read_ahead.announce(())  # what was read ahead is not divided
-        if self.resident:
-            self._all = self._all._replace(gain=gains.to(self.device))
+        self._gains = gains.to(self.device)
 
     def set_depth_factor(self, index: int, alignment: Float[Tensor, "2"], factor: Float[Tensor, "H W"]) -> None:
         """Multiplies the aligned inverse depth of a view by a factor, once; the alignment stays the same."""
@@ -234,15 +237,19 @@ class Views:
     def _corrected(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
         return camera if self.poses is None else self.poses.moved(camera, index)
 
-    def _view(self, stored: StoredView, index: Int64[Tensor, "1"]) -> View:
-        height, width = stored.static_mask.shape
-        image = stored.image.float() / 255.0
+    def _view(self, pixels: Pixels, index: Int64[Tensor, "1"]) -> View:
+        """A view on the device."""
+        viewmat, K, time, mask_trust = (
+            values.index_select(0, index)[0] for values in (self._viewmats, self._Ks, self._times, self.mask_trust)
+        )
+        height, width = pixels.static_mask.shape
+        image = pixels.image.float() / 255.0
         return View(
-            self._corrected(Camera(stored.viewmat, stored.K, width, height), index),
-            stored.time,
-            image if stored.gain is None else image / stored.gain,
-            stored.static_mask,
-            stored.mask_border,
-            stored.inverse_depth.float(),
-            self.mask_trust.index_select(0, index)[0],
+            self._corrected(Camera(viewmat, K, width, height), index),
+            time,
+            image if self._gains is None else image / self._gains.index_select(0, index)[0],
+            pixels.static_mask,
+            pixels.mask_border,
+            pixels.inverse_depth.float(),
+            mask_trust,
         )
