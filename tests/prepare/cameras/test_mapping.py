@@ -8,7 +8,7 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from warpgs.prepare.cameras.features import Job
-from warpgs.prepare.cameras.mapping import _adjusted
+from warpgs.prepare.cameras.mapping import _adjusted, continuous
 from warpgs.prepare.cameras.matches import all_pairs
 
 FOCAL, MIDDLE, NUM_FRAMES = 500.0, (320.0, 240.0), 12
@@ -75,3 +75,41 @@ def test_far_points_tell_how_the_cameras_are_turned(tmp_path):
 def test_features_that_are_slightly_wrong_hardly_turn_the_cameras(tmp_path):
     model = adjusted(tmp_path, points(200, 4.0, 8.0), displaced=3.5)
     assert turned(model) < 0.17  # by least squares 0.21
+
+
+def in_two_parts(scales: list[float]) -> Any:
+    """A reconstruction of frames that are consistent with the ones before where ``scales`` stays the same."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, 640, 480)
+    model.add_camera_with_trivial_rig(camera)
+    scene = points(50, 4.0, 8.0)
+    for k, scale in enumerate(scales):
+        pixels = FOCAL * scene[:, :2] / scene[:, 2:] + MIDDLE
+        image = pycolmap.Image(name=f"{k:02d}.png", keypoints=pixels, camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.1 * k, 0, 0])))
+        for j, position in enumerate(scene):
+            track = pycolmap.Track()
+            track.add_element(k + 1, j)
+            model.add_point3D(scale * position, track)
+    return model
+
+
+def names(model: Any) -> list[str]:
+    return sorted(image.name[:2] for image in model.images.values() if image.has_pose)
+
+
+def test_frames_with_a_scale_of_their_own_are_removed():
+    assert names(continuous(in_two_parts([1, 1, 1, 1, 100, 100]))) == ["00", "01", "02", "03"]
+    assert names(continuous(in_two_parts([1, 1, 1e-3, 1e-3, 1e-3]))) == ["02", "03", "04"]
+    assert names(continuous(in_two_parts([1, 1, -1, 1, 1, 1]))) == ["03", "04", "05"]  # in front of what it sees
+
+
+def test_frames_of_a_camera_that_comes_nearer_stay():
+    assert len(names(continuous(in_two_parts([8, 4, 2, 1, 0.5])))) == 5
+
+
+def test_frames_that_see_no_point_are_removed():
+    model = in_two_parts([1, 1, 1, 1])
+    for point in [*model.images[4].points2D]:
+        model.delete_point3D(point.point3D_id)
+    assert names(continuous(model)) == ["00", "01", "02"]
