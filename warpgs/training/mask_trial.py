@@ -36,9 +36,6 @@ HELD_OUT = 8
 MIN_FRAMES = 16
 """Minimum number of training frames for a trial; two of them are held out."""
 
-MIN_GAIN = 0.5
-"""By how much held-out frames must be better without the masks, because without them nothing is static [dB]."""
-
 
 def with_trusted_masks(
     config: TrainConfig, capture: Capture, log: Callable[[str], None], quiet: bool
@@ -73,7 +70,7 @@ def with_trusted_masks(
     trial = {"mask_trial_psnr_with": following, "mask_trial_psnr_without": ignoring}
     trial["mask_trial_seconds"] = time.perf_counter() - start
     found = f"frames held out of the trial have {following:.1f} dB with the masks and {ignoring:.1f} dB without"
-    if not ranks.text_of_first("worse" if ignoring > following + MIN_GAIN else ""):
+    if not ranks.text_of_first("worse" if ignoring > following else ""):
         log(f"{found}: the masks are used")
         return config, trial
     log(f"{found}: the masks are not used, everything is dynamic (--no-try-masks uses them all the same)")
