@@ -93,9 +93,6 @@ PAPER = {
         "model.dropout": 0.0,
         "schedule.settle": 0,
         "loss.squared": 0.0,
-        "loss.opacity": 0.0,
-        "loss.scale": 0.0,
-        "densify.noise": 5e5,  # of the strategy "mcmc" alone
         "loss.acceleration": 0.0,
         "loss.hidden_appearance": True,
         "densify.reseed": 0.0,

@@ -14,7 +14,6 @@ from tests.scenes import (
     generator,
     make_camera,
     make_splats,
-    relative_error,
     select,
 )
 from warpgs.config import RenderSettings
@@ -38,7 +37,7 @@ WEIGHTS = [0.0, 0.2]
 @pytest.fixture(autouse=True)
 def terms_of_the_paper(monkeypatch):
     """A term that is added to the dictionary has tests of its own."""
-    known = {"static", "dynamic", "joint", "squared", "depth", "depth_dynamic", "opacity", "scale"}
+    known = {"static", "dynamic", "joint", "squared", "depth", "depth_dynamic"}
     for name in TERMS.keys() - known:
         monkeypatch.delitem(TERMS, name)
 
@@ -243,13 +242,6 @@ def test_without_its_gate_the_depth_term_is_equation_14_in_transparent_pixels_to
     assert all(parameter.isfinite().all() for parameter in scene.parameters())
 
 
-def test_the_means_of_opacities_and_standard_deviations_can_be_terms():
-    terms, _ = terms_of("stage2", dataclasses.replace(LOSS, opacity=3.0, scale=5.0))
-    assert {"opacity", "scale"}.isdisjoint(terms_of("stage2")[0])
-    assert relative_error(terms["opacity"], 3.0 * SPLATS.opacities.mean()) < 1e-5
-    assert relative_error(terms["scale"], 5.0 * SPLATS.scales.mean() / VIEW_SIZE) < 1e-5
-
-
 def terms_with_trust(weight, margin, loss=LOSS, **options):
     _, plan, step = prepared("stage1", loss, trust=(weight, margin), **options)
     step(plan, Sample(0, 0.0, 0))
@@ -257,12 +249,10 @@ def terms_with_trust(weight, margin, loss=LOSS, **options):
 
 
 def test_lengths_in_the_loss_are_in_view_sizes_or_as_in_the_paper_in_scene_units():
-    loss = dataclasses.replace(LOSS, scale=5.0)
     in_views, in_scene = (
-        terms_with_trust(1.0, 0.0, loss, densify=plain.densify(unit=unit, split_size=0.01))
-        for unit in ("pixel", "extent")
+        terms_with_trust(1.0, 0.0, densify=plain.densify(unit=unit, split_size=0.01)) for unit in ("pixel", "extent")
     )
-    lengths = {"depth", "depth_dynamic", "scale"}
+    lengths = {"depth", "depth_dynamic"}
     ratios = {name: in_scene[name] / in_views[name] for name in in_views}
     assert ratios == pytest.approx({name: VIEW_SIZE if name in lengths else 1.0 for name in ratios}, rel=1e-5)
 

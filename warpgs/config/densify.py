@@ -13,8 +13,7 @@ class DensifyConfig:
     strategy: str = "3dgs"
     """Density strategy, a key of DENSITY in warpgs/training/density/__init__.py: clone and split where the gradient on
     screen is large (3dgs), or the sum of the absolute values of its parts, which needs a larger ``gradient``, 8e-4 in
-    gsplat (absgrad); or Markov chain Monte Carlo, which copies opaque Gaussians in the place of transparent ones, up to
-    ``max_gaussians``, and for which its authors set ``loss.opacity`` and ``loss.scale`` to 0.01 (mcmc)."""
+    gsplat (absgrad)."""
     every: Annotated[int, Bounds(min=1)] = 100
     """Iterations between densifications; ``--iterations`` does not rescale it, because it is a sample size."""
     gradient: float = 3e-4
@@ -22,17 +21,15 @@ class DensifyConfig:
     unit: Literal["pixel", "extent"] = "pixel"
     """Unit of ``split_size``, which is a standard deviation: a pixel of the nearest training view that
     has shown the Gaussian since the last densification, at its depth there; or the radius of the cameras' positions, as
-    in 3DGS (paper). Gaussians that no view has shown have any size in pixels. With pixel, errors of depth,
-    ``loss.scale`` and ``noise`` are in view sizes of the capture (docs/glossary.md), and offsets of the deformation in
-    halves of it; else all are in scene units."""
+    in 3DGS (paper). Gaussians that no view has shown have any size in pixels. With pixel, errors of depth are
+    in view sizes of the capture (docs/glossary.md), and offsets of the deformation in halves of it; else both are in
+    scene units."""
     split_size: Annotated[float, Bounds(positive=True)] = 2.0
     """Size above which a Gaussian is split instead of cloned. Above ten times this size, as in 3DGS, Gaussians are
     removed once opacities have been reset, and ``max_elongation`` holds."""
     max_elongation: float = 10.0
     """After every ``every`` iterations and at the end, the longest axis of static Gaussians is cut to this many times
     their second longest, or to ten times ``split_size`` if that is longer. 0: never."""
-    noise: float = 5e5
-    """Factor of the noise on positions in strategy mcmc, next to their learning rate and covariance."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
     min_pixels: int = 24

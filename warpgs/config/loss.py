@@ -44,10 +44,6 @@ class LossConfig:
     object_depth: bool = True
     """Whether dynamic objects of unknown depth get one by their size, and uncertain depth of objects is averaged with
     that (docs/design/object-depth.md)."""
-    opacity: float = 0.0
-    """Weight of the mean opacity of all Gaussians."""
-    scale: float = 0.0
-    """Weight of the mean standard deviation of all Gaussians along their axes [view sizes]."""
     mask_margin: Annotated[float, Bounds(max=1)] = 0.008
     """Half width of the band along borders of masks in which the dynamic image is not compared, as a fraction of the
     image's larger side; 0 in the paper. Masks are a few pixels off: a rim of background would be learned as moving."""

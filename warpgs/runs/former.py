@@ -50,6 +50,9 @@ REMOVED: dict[str, Removed] = {
         lambda value, densify: isclose(value, 10.0 * densify.get("split_size", densify.get("dense_fraction", nan))),
     ),
     "densify.min_opacity": _always(0.005),
+    "densify.noise": Removed("there is no strategy mcmc any more"),
+    "loss.opacity": Removed("there is no such term any more", lambda value, section: value == 0.0),
+    "loss.scale": Removed("there is no such term any more", lambda value, section: value == 0.0),
     "loss.dynamic_background": Removed(),
     "loss.dynamic": _always(1.0),
     "loss.joint": _always(1.0),
@@ -101,7 +104,6 @@ FORMER: dict[str, dict[str, Any]] = {
     "densify": {
         "max_elongation": 0.0,
         "min_pixels": 0,
-        "noise": 5e5,
         "reseed": 0.0,
         "strategy": "3dgs",
         "unit": "extent",
@@ -117,8 +119,6 @@ FORMER: dict[str, dict[str, Any]] = {
         "hidden_appearance": True,
         "mask_margin": 0.0,
         "object_depth": False,
-        "opacity": 0.0,
-        "scale": 0.0,
         "squared": 0.0,
     },
     "model": {

@@ -68,16 +68,6 @@ def depth_dynamic(inputs: LossInputs) -> Float[Tensor, ""]:
     return _depth_error(inputs, inputs.rendering.dynamic, ~inputs.view.static_mask, no_margin)
 
 
-def opacity(inputs: LossInputs) -> Float[Tensor, ""]:
-    """The mean opacity (Kheradmand et al. 2024, Eq. 10): Gaussians that nothing needs vanish."""
-    return inputs.splats.opacities.sum() / max(1, len(inputs.splats.means))
-
-
-def scale(inputs: LossInputs) -> Float[Tensor, ""]:
-    """The mean standard deviation (Kheradmand et al. 2024, Eq. 10), in ``LossInputs.unit``."""
-    return inputs.splats.scales.sum() / (max(1, inputs.splats.scales.numel()) * inputs.unit)
-
-
 TERMS: dict[str, LossTerm] = {
     "static": LossTerm(static, is_active=lambda phase, config: phase.with_branches),
     "dynamic": LossTerm(dynamic, is_active=lambda phase, config: phase.stage != "pretrain" and phase.with_branches),
@@ -101,16 +91,6 @@ TERMS: dict[str, LossTerm] = {
         depth_dynamic,
         is_active=lambda phase, config: phase.with_depth and phase.stage != "pretrain" and config.depth_dynamic > 0,
         weight=lambda plan, config: config.depth_dynamic * plan.depth_weight,
-    ),
-    "opacity": LossTerm(
-        opacity,
-        is_active=lambda phase, config: config.opacity > 0,
-        weight=lambda plan, config: config.opacity,
-    ),
-    "scale": LossTerm(
-        scale,
-        is_active=lambda phase, config: config.scale > 0,
-        weight=lambda plan, config: config.scale,
     ),
 }
 """Terms of the loss by name; gradients are accumulated in this order."""

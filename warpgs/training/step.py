@@ -1,7 +1,6 @@
 """One training step: render the three images, compare them with the ground truth, take one step of Adam."""
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -143,10 +142,6 @@ class Step:
             self._run(plan.phase)
         else:
             self._graphs.run(plan.phase, partial(self._run, plan.phase))
-
-    def after_step(self, generator: Callable[[str, torch.device], torch.Generator]) -> None:
-        """What density control does after every step of Adam; see ``Strategy.after_step``."""
-        self.density.after_step(self.scene, self.optimizer, self.config.length_unit(self.unit), generator)
 
     def release_graphs(self) -> None:
         """Frees the memory of the CUDA graphs; from then on, iterations are eager."""

@@ -104,7 +104,6 @@ class Trainer:
             plan = self.protocol.at(self.iteration)
             self.views.announce(self._sampler.views(self.iteration, self.rollbacks))
             self.step(plan, self._sample(plan))
-            self.step.after_step(self._generator)
             if plan.actions:
                 self._adapt(plan, logger)
             self.iteration += 1

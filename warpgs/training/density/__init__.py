@@ -8,13 +8,11 @@ from warpgs.errors import suggestion
 
 from .absgrad import AbsoluteGradientStrategy
 from .gradient import GradientStrategy
-from .mcmc import McmcStrategy
 from .strategy import Strategy
 
 DENSITY: dict[str, type[Strategy]] = {
     "3dgs": GradientStrategy,
     "absgrad": AbsoluteGradientStrategy,
-    "mcmc": McmcStrategy,
 }
 """Strategies by name, each constructed from a ``DensifyConfig``."""
 

@@ -11,7 +11,7 @@ from warpgs.ops.adam import Adam
 from warpgs.training import optimizer as optim
 
 MIN_OPACITY = 0.005
-"""Opacity below which Gaussians are removed or relocated (3DGS)."""
+"""Opacity below which Gaussians are removed (3DGS)."""
 
 SPLIT_SHRINK = 1.6
 """Factor by which the children of a split are smaller than their parent (3DGS: 0.8 · 2)."""

@@ -8,9 +8,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import DensifyConfig, RenderSettings
-from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
-from warpgs.ops.adam import Adam
 from warpgs.runtime import ranks
 from warpgs.training.schedule import Action
 
@@ -66,18 +64,6 @@ class Strategy:
         """
         shown = torch.where(radii[:, 0] > 0, camera.focal / camera.depths(splats.means), 0.0)
         torch.maximum(self.resolution, shown, out=self.resolution)
-
-    def after_step(
-        self, scene: SplitScene, optimizer: Adam, unit: float, generator: Callable[[str, torch.device], torch.Generator]
-    ) -> None:
-        """Changes Gaussians, but not their numbers, after every step of Adam, alike on all ranks.
-
-        Args:
-            scene: Changed in place.
-            optimizer: Its optimizer, after the step.
-            unit: Length that counts as 1 (``TrainConfig.length_unit``) [scene units].
-            generator: Makes the generator of random numbers for a purpose on a device; they are the same on all ranks.
-        """
 
     def state(self) -> dict[str, Float[Tensor, " N"]]:
         """What was observed, by name: checkpoints keep it, and resuming fills it. Finite and never negative."""
