@@ -40,6 +40,13 @@ def test_remedies_use_what_the_views_hold_instead_of_decoding_frames_again(data,
     start.capture._cached.assert_not_called()
 
 
+@pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
+def test_frames_that_views_hold_are_not_kept_by_the_capture(data, resident_bytes):
+    capture = load_capture(data)
+    prepare_start(dataclasses.replace(tiny.CONFIG, resident_bytes=resident_bytes), capture)
+    assert (capture._cached.cache_info().currsize == 0) == (resident_bytes > 0)
+
+
 @pytest.mark.parametrize("assume", ["static", "dynamic"])
 def test_masks_that_are_not_used_are_not_doubted(capture, assume):
     start = prepare_start(dataclasses.replace(tiny.CONFIG, assume=assume), capture)

@@ -311,6 +311,10 @@ class Capture:
         static = torch.full(frame.image.shape[:2], self.assumption == "static")
         return replace(frame, static_mask=static if frame.empty is None else static | frame.empty)
 
+    def forget_frames(self) -> None:
+        """Drops the frames in memory, as of all captures with the same cache; they are read again when asked for."""
+        self._cached.cache_clear()
+
     def frames(self, names: Sequence[str]) -> Iterator[Frame]:
         """Frames one after the other, read ahead by threads; raises as ``frame``."""
         return ReadAhead(self.frame).each(names)

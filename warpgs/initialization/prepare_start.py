@@ -70,6 +70,8 @@ def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
         DepthTrust(*torch.ones(2, num, dtype=torch.float32, device=device)),
         resumed,
     )
+    if views.resident:
+        capture.forget_frames()  # the views hold them
     if (cache := views.cache) is not None:
         read = "read from a file" if cache.fits else "decoded in every iteration: there is no space for a file"
         size = f"views of {cache.nbytes / 1e6:,.0f} MB exceed --resident-bytes or differ in size"
