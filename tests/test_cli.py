@@ -143,6 +143,11 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["import"], "warpgs import: missing: SOURCE CAPTURE\n"),
         (["train", "--resume"], "warpgs train: missing value for --resume\n"),
         (["train", "--iterations", "x"], "warpgs train: error parsing --iterations: expected INT, got 'x'"),
+        (
+            ["train", "--model.appearance-size", "4"],
+            "warpgs train: error parsing --model.appearance-size: expected INT INT, got '4'\n",
+        ),
+        (["train", "--no-dap"], "warpgs train: there is no option --no-dap any more: --omit dap omits it\n"),
         (["report", "r", "--views", "x"], "warpgs report: error parsing --views: expected INT, got 'x'"),
         (["prepare", "v", "c", "--start", "x"], "warpgs prepare: error parsing --start: expected FLOAT, got 'x'"),
         (["train", "--preset", "x"], "warpgs train: --preset must be one of best, paper, patient, quick, got 'x'\n"),

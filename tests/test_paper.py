@@ -38,8 +38,6 @@ PAPER = {
         "loss.depth_dynamic": 0.0,
         "loss.depth_gate": False,
         "loss.depth_tolerance": 0.0,
-        "loss.depth_margin": 0.0,
-        "loss.depth_smooth": False,
         "loss.object_depth": False,
     },
     "Training Protocol: Eq. 15": {

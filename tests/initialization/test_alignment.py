@@ -54,9 +54,11 @@ def test_depth_that_is_noise_is_not_trusted():
     assert torch.equal(aligned(0.5, signal=0.0).trust(plain.loss(depth_tolerance=0.03)).weight, torch.zeros(3))
 
 
-def test_without_a_tolerance_every_view_is_trusted():
-    assert torch.equal(aligned(0.1).trust(plain.loss(depth_tolerance=0.0)).weight, torch.ones(3))
-    assert torch.equal(aligned(0.5, signal=0.0).trust(plain.loss(depth_tolerance=0.0)).weight, torch.ones(3))
+def test_without_a_tolerance_every_view_is_trusted_and_every_error_counts():
+    for found in (aligned(0.1), aligned(0.5, signal=0.0)):
+        trust = found.trust(plain.loss(depth_tolerance=0.0))
+        assert torch.equal(trust.weight, torch.ones(3))
+        assert torch.equal(trust.margin, torch.zeros(3))
 
 
 def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
@@ -65,16 +67,15 @@ def test_a_view_with_too_few_points_is_trusted_as_much_as_the_others():
     assert error(trust.weight, torch.tensor([0.5, 0.1, 0.1, 0.0])) < 1e-6  # torch's median is the lower one
 
 
-def test_the_margin_is_a_multiple_of_the_error_of_each_view():
+def test_the_margin_is_three_times_the_error_of_each_view():
     errors = torch.tensor([[0.03, 0.4], [torch.inf, torch.inf], [0.01, 0.4], [0.02, 0.4]])
-    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(plain.loss(depth_margin=3.0))
+    trust = alignment.DepthAlignment(torch.ones(4, 2), errors, errors[:, 0]).trust(plain.loss(depth_tolerance=0.03))
     assert error(trust.margin, torch.tensor([0.09, 0.06, 0.03, 0.06])) < 1e-7
-    assert torch.equal(trust.weight, torch.ones(4))
 
 
 def test_without_points_nothing_is_refused():
     found = alignment.DepthAlignment(torch.full((2, 2), torch.nan), torch.full((2, 2), torch.inf), torch.zeros(2))
-    trust = found.trust(plain.loss(depth_tolerance=0.03, depth_margin=3.0))
+    trust = found.trust(plain.loss(depth_tolerance=0.03))
     assert torch.equal(trust.weight, torch.ones(2))
     assert torch.equal(trust.margin, torch.zeros(2))
 

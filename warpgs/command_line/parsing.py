@@ -60,7 +60,10 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         _choices,
     ),
     (r"^Missing value for argument '(\S+?)'.*", r"missing value for \1"),
-    (r"no type matching \{None\}\|(\w+) could be instantiated from \[(.*?)\].*", r"expected \1, got \2"),
+    (
+        r"no type matching \{None\}\|\{?([A-Z ]+?)\}? could be instantiated from \[(.*?)\]\..*",
+        r"expected \1, got \2",
+    ),
 )
 """Parts of tyro's messages and what is said instead."""
 

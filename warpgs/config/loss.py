@@ -35,12 +35,10 @@ class LossConfig:
     or compares that image alone, as the authors' code does; given-masks: keeps them unless `prepare` made the masks."""
     depth_tolerance: float = 0.03
     """Relative error of a view's aligned depth at the sparse points at which its weight is halved: λ_depth is divided
-    by 1 + (error / tolerance)², and depth hardly better than a constant is not used. 0: equal weights (paper)."""
-    depth_margin: float = 3.0
-    """Errors of the static depth up to this many times the relative error of the view's aligned depth at the sparse
-    points are not penalized, because the images determine the geometry better. 0: every error is (paper)."""
-    depth_smooth: bool = True
-    """Whether aligned depth is also multiplied by a smooth factor per view that brings it to the sparse points."""
+    by 1 + (error / tolerance)², and depth hardly better than a constant is not used. Errors of the static depth up to 3
+    times that of the view are not penalized, because the images determine the geometry better, and aligned depth is
+    also multiplied by a smooth factor per view that brings it to the sparse points. 0: equal weights, no margin, no
+    factor (paper)."""
     object_depth: bool = True
     """Whether dynamic objects of unknown depth get one by their size, and uncertain depth of objects is averaged with
     that (docs/design/object-depth.md)."""

@@ -43,8 +43,6 @@ PAPER = replace(
         depth_gate=False,
         branches_in_stage2="yes",
         depth_tolerance=0.0,
-        depth_margin=0.0,
-        depth_smooth=False,
         object_depth=False,
         mask_margin=0.0,
     ),

@@ -18,13 +18,17 @@ MAX_SAMPLES_ON_CPU, MAX_SAMPLES_ON_GPU = 1 << 16, 1 << 20
 """Numbers of samples that are fitted at once: as many as fit into a CPU's cache, or as keep a GPU busy for longer than
 it takes to launch its kernels."""
 
+MARGIN = 3.0
+"""Errors of the static depth up to this many times the relative error of the view's aligned depth at the sparse points
+are not penalized where depth has a tolerance (``LossConfig.depth_tolerance``)."""
+
 
 class DepthTrust(NamedTuple):
     """How much the aligned depth of views is trusted, by its error at the sparse points.
 
     Attributes:
         weight: Factor of the terms of depth, in [0, 1]; 0 = the depth is not used. See ``LossConfig.depth_tolerance``.
-        margin: Relative error of the static depth that is not penalized. See ``LossConfig.depth_margin``.
+        margin: Relative error of the static depth that is not penalized. See ``MARGIN``.
     """
 
     weight: Float[Tensor, "*T"]
@@ -52,7 +56,8 @@ class DepthAlignment(NamedTuple):
         if loss.depth_tolerance:
             refused = depth_alignment.is_unusable(self.errors)
             weight = torch.where(refused, 0.0, 1.0 / (1.0 + (errors / loss.depth_tolerance) ** 2))
-        return DepthTrust(weight, loss.depth_margin * errors)
+            return DepthTrust(weight, MARGIN * errors)
+        return DepthTrust(weight, torch.zeros_like(errors))
 
 
 def require_no_depth(capture: Capture, views: Views) -> None:

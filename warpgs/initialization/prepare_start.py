@@ -125,7 +125,7 @@ def _align_depth(start: Start) -> Start:
     plan = start.plan
     if not plan.depth:
         require_no_depth(start.capture, start.views)
-    found = align_to_points(start.capture, start.views, smooth=plan.loss.depth_smooth)
+    found = align_to_points(start.capture, start.views, smooth=plan.loss.depth_tolerance > 0.0)
     for tensor in found:
         ranks.copy_first_(tensor)
     trust = found.trust(plan.loss)

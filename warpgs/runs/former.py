@@ -54,6 +54,14 @@ REMOVED: dict[str, Removed] = {
     "loss.opacity": Removed("there is no such term any more", lambda value, section: value == 0.0),
     "loss.scale": Removed("there is no such term any more", lambda value, section: value == 0.0),
     "loss.dynamic_background": Removed(),
+    "loss.depth_margin": Removed(
+        "it is 3 with loss.depth_tolerance, else 0",
+        lambda value, loss: value == (3.0 if loss.get("depth_tolerance") else 0.0),
+    ),
+    "loss.depth_smooth": Removed(
+        "it is on with loss.depth_tolerance, else off",
+        lambda value, loss: value == bool(loss.get("depth_tolerance")),
+    ),
     "loss.dynamic": _always(1.0),
     "loss.joint": _always(1.0),
     "loss.mask_tolerance": Removed(),
@@ -113,8 +121,6 @@ FORMER: dict[str, dict[str, Any]] = {
         "acceleration": 0.0,
         "branches_in_stage2": "yes",
         "depth_gate": True,
-        "depth_margin": 0.0,
-        "depth_smooth": False,
         "depth_tolerance": 0.0,
         "hidden_appearance": True,
         "mask_margin": 0.0,
