@@ -56,8 +56,7 @@ PAPER = {
     },
     "Deformable-3DGS: network": {"model.depth": 8, "model.width": 256, "model.skip": 5},
     "Deformable-3DGS: optimization": {
-        "optim.means": 1.6e-4,
-        "optim.means_scale": 5.0,
+        "optim.means": 1.6e-4 * 5,
         "optim.means_anneal": "trained",
         "optim.sh_dc": 2.5e-3,
         "schedule.deform_from": 3_000,

@@ -213,6 +213,22 @@ def test_what_the_appearance_network_changes_was_two_options(run, degree, opacit
         assert read_config(run).model.appearance == appearance
 
 
+@pytest.mark.parametrize(("factor", "means", "unit"), [(None, 2e-4, 7.0), (5.0, 1e-3, 1.0)])
+def test_the_rate_of_positions_had_a_factor_of_its_own(run, factor, means, unit):
+    """In version 0.3, which had no other unit than the extent."""
+
+    def change(values):
+        del values["means_in_views"]
+        values["optim"] |= {"means": 2e-4, "means_scale": factor}
+        values["densify"] |= {"unit": "extent", "split_size": 0.01}
+
+    edit(run, change)
+    plan = read_config(run)
+    assert plan.optim.means == pytest.approx(means)
+    assert plan.means_unit(7.0) == unit
+    assert plan.length_unit(7.0) == 1.0
+
+
 @pytest.mark.parametrize(("before", "start"), [(None, "frames"), ("points", "frames"), ("uniform", "plain")])
 def test_where_dynamic_gaussians_start_was_an_option_of_its_own(run, before, start):
     def change(values):
@@ -383,7 +399,8 @@ def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, 
 
     edit(run, reduce)
     densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01)
-    assert read_config(run) == plain.plan(dataclasses.replace(written, data=None, densify=densify))
+    expected = plain.plan(dataclasses.replace(written, data=None, densify=densify))
+    assert read_config(run) == dataclasses.replace(expected, means_in_views=True)
 
 
 def test_a_section_that_is_not_an_object_is_refused(run):

@@ -257,6 +257,14 @@ def test_lengths_in_the_loss_are_in_view_sizes_or_as_in_the_paper_in_scene_units
     assert ratios == pytest.approx({name: VIEW_SIZE if name in lengths else 1.0 for name in ratios}, rel=1e-5)
 
 
+@pytest.mark.parametrize(("unit", "length"), [("pixel", VIEW_SIZE), ("extent", 1.0)])
+def test_rates_of_positions_are_in_view_sizes_or_as_in_the_paper_in_scene_units(unit, length):
+    densify = plain.densify(unit=unit, split_size=0.01)
+    _, plan, step = prepared("pretrain", densify=densify, optim=plain.optim(means=0.01))
+    step(plan, Sample(0, 0.0, 0))
+    assert step._inputs.learning_rates["static.means"].item() == pytest.approx(0.01 * length)
+
+
 def test_depth_terms_are_multiplied_by_the_trust_in_the_view():
     whole, part = terms_with_trust(1.0, 0.0), terms_with_trust(0.25, 0.0)
     for name in ("depth", "depth_dynamic"):

@@ -215,14 +215,6 @@ def test_the_rate_of_positions_decays_to_a_hundredth_in_a_unit(progress, factor)
         assert rates[f"{branch}.means"] == pytest.approx(0.1 * 3.0 * factor)
 
 
-@pytest.mark.parametrize("unit", [0.3, 7.0])
-def test_the_rate_of_positions_can_have_a_scale_of_its_own_whatever_the_scene(unit):
-    config = plain.optim(means=1.6e-4, means_scale=5.0)
-    start, end = (rates_at(k, START, unit, config)["dynamic.means"] for k in (0.0, 1.0))
-    assert start == pytest.approx(8e-4)
-    assert end == pytest.approx(8e-6)
-
-
 def test_the_rate_of_positions_decays_by_branch():
     rates = rates_at(0.3, START, means_progress={"static": 1.0, "dynamic": 0.5})
     assert rates["static.means"] == pytest.approx(0.1 * 0.01)

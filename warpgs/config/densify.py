@@ -19,11 +19,11 @@ class DensifyConfig:
     gradient: float = 3e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
     unit: Literal["pixel", "extent"] = "pixel"
-    """Unit of ``split_size``, which is a standard deviation: a pixel of the nearest training view that
-    has shown the Gaussian since the last densification, at its depth there; or the radius of the cameras' positions, as
-    in 3DGS (paper). Gaussians that no view has shown have any size in pixels. With pixel, errors of depth are
-    in view sizes of the capture (docs/glossary.md), and offsets of the deformation in halves of it; else both are in
-    scene units."""
+    """Unit of ``split_size``, which is a standard deviation: a pixel of the nearest training view that has shown the
+    Gaussian since the last densification, at its depth there; or the radius of the cameras' positions, as in 3DGS
+    (paper). Gaussians that no view has shown have any size in pixels. With pixel, rates of positions and
+    errors of depth are in view sizes of the capture (docs/glossary.md), and offsets of the deformation in halves of it;
+    else all are in scene units."""
     split_size: Annotated[float, Bounds(positive=True)] = 2.0
     """Size above which a Gaussian is split instead of cloned. Above ten times this size, as in 3DGS, Gaussians are
     removed once opacities have been reset, and ``max_elongation`` holds."""

@@ -11,10 +11,8 @@ class OptimConfig:
     """Learning rates of Adam; those of Deformable-3DGS where the paper names none, as those that are no options."""
 
     means: float = 5e-4
-    """Positions, times ``means_scale``; decays exponentially to 1 %."""
-    means_scale: Annotated[float | None, Bounds(positive=True)] = None
-    """Factor of the rate of positions: the view size of the capture if None, 5 in Deformable-3DGS, which the paper
-    builds upon: 8e-4 is also the rate that it prints (section Experimental Setup)."""
+    """Positions [view sizes; scene units if ``densify.unit`` is extent]; decays exponentially to 1 %. 8e-4, the rate
+    that the paper prints, is also that of Deformable-3DGS, 1.6e-4 times 5 (paper)."""
     means_anneal: Literal["run", "trained"] = "run"
     """Iterations over which the rate of positions decays: the whole run, or those in which a branch's positions are
     trained: static ones until stage II (paper, section Static Component), dynamic ones from stage I."""

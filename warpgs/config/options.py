@@ -110,6 +110,10 @@ class TrainConfig:
         """Whether stage II no longer optimizes this part of static Gaussians."""
         return self.frozen in (part, "all")
 
+    def means_unit(self, view_size: float) -> float:
+        """Length of 1 in the learning rate of positions [scene units], from a capture's view size."""
+        return self.length_unit(view_size)
+
     def length_unit(self, view_size: float) -> float:
         """Length of 1 in the loss and the noise [scene units], from a capture's view size."""
         return view_size if self.densify.unit == "pixel" else 1.0

@@ -25,19 +25,27 @@ class Plan(TrainConfig):
 
     Attributes:
         branches_in_stage2: Whether stage II compares the images of the single branches.
+        means_in_views: Whether ``optim.means`` is in view sizes, not in scene units: as ``densify.unit`` says, but for
+            runs of version 0.3.
     """
 
     iterations: None = None
     device: Device = field(kw_only=True)
     background: Background = field(kw_only=True)
     branches_in_stage2: bool = field(kw_only=True)
+    means_in_views: bool = field(kw_only=True)
 
     @staticmethod
     def of(config: TrainConfig, device: Device, background: Background, branches_in_stage2: bool) -> "Plan":
         """The plan of a config whose schedule is rescaled already."""
         values = {name.name: getattr(config, name.name) for name in dataclasses.fields(TrainConfig)}
         values |= {"device": device, "background": background, "iterations": None}
-        return Plan(**values, branches_in_stage2=branches_in_stage2)
+        in_views = config.densify.unit == "pixel"
+        return Plan(**values, branches_in_stage2=branches_in_stage2, means_in_views=in_views)
+
+    def means_unit(self, view_size: float) -> float:
+        """See ``TrainConfig.means_unit``."""
+        return view_size if self.means_in_views else 1.0
 
 
 def extended(plan: Plan, iterations: int | None) -> Plan:

@@ -46,7 +46,7 @@ PAPER = replace(
         object_depth=False,
         mask_margin=0.0,
     ),
-    optim=replace(BEST.optim, means=1.6e-4, means_scale=5.0, means_anneal="trained", poses=0.0),
+    optim=replace(BEST.optim, means=8e-4, means_anneal="trained", poses=0.0),
     densify=replace(
         BEST.densify,
         gradient=2e-4,

@@ -75,6 +75,7 @@ REMOVED: dict[str, Removed] = {
     "model.path_points": Removed(),
     "model.paths": Removed(),
     "model.point_colors": Removed("--model.start has it"),
+    "optim.means_scale": Removed("--optim.means is in view sizes, with --densify.unit extent in scene units"),
     "optim.opacities": _always(0.05),
     "optim.quats": _always(1e-3),
     "optim.scales": _always(5e-3),
@@ -134,7 +135,7 @@ FORMER: dict[str, dict[str, Any]] = {
         "raw_input": True,
         "tracks": True,
     },
-    "optim": {"means_anneal": "run", "means_scale": None, "poses": 0.0},
+    "optim": {"means_anneal": "run", "poses": 0.0},
     "schedule": {"fit_motion": 0, "joint_from": None, "settle": 0},
 }
 """Values that runs of versions without these fields had, by section, "" for those outside. A field that is not here has
@@ -244,6 +245,15 @@ def _appearance(values: dict[str, Any]) -> None:
         )
 
 
+def _means(values: dict[str, Any]) -> None:
+    """The rate of positions had a factor of its own, and was in extents of the cameras in version 0.3."""
+    if isinstance(optim := values.get("optim"), dict):
+        means, factor = optim.get("means"), optim.get("means_scale")
+        values.setdefault("means_in_views", factor is None)
+        if isinstance(means, float) and isinstance(factor, float):
+            optim["means"] = means * factor
+
+
 def _start(values: dict[str, Any]) -> None:
     """Colours, sizes and places at which Gaussians start were options of their own, of which paper 0.3 had the last."""
     if isinstance(model := values.get("model"), dict):
@@ -256,5 +266,5 @@ def _masks(values: dict[str, Any]) -> None:
         values.setdefault("damage_masks", ",".join(f"{kind}:{size}" for kind, size in masks.items() if size) or None)
 
 
-CHANGES = (_looked_up, _losses, _switches, _factor, _appearance, _start, _masks)
+CHANGES = (_looked_up, _losses, _switches, _factor, _appearance, _means, _start, _masks)
 """What was written otherwise; each changes the values in place."""

@@ -98,16 +98,15 @@ def learning_rates(config: OptimConfig, unit: float, at: RatePlan) -> dict[str, 
 
     Args:
         config: Rates of one view per step.
-        unit: Factor of the rate of positions if ``OptimConfig.means_scale`` is None [scene units].
+        unit: Length of 1 in the rate of positions (``TrainConfig.means_unit``) [scene units].
         at: Of the iteration.
     """
-    scale = unit if config.means_scale is None else config.means_scale
     gaussians = {**FIXED_RATES, "sh_dc": config.sh_dc}
     settled = exponential(1.0, SETTLE_DECAY, at.settle_progress)
     rates = {f"{branch}.{name}": settled * rate for branch in BRANCHES for name, rate in gaussians.items()}
     for branch in BRANCHES:
         decayed = exponential(config.means, MEANS_DECAY * config.means, at.means_progress[branch])
-        rates[f"{branch}.means"] = decayed * scale
+        rates[f"{branch}.means"] = decayed * unit
     for name in NETWORKS:
         rate = exponential(config.networks, config.networks_end, at.network_progress[name])
         rates[name] = at.warmup_factors[name] * rate

@@ -77,7 +77,7 @@ class Step:
         views: Training views.
         alignments: [T, 2] scale and offset of each view's inverse depth; may be changed in place.
         depth_trust: [T] how much the depth of each view is trusted.
-        unit: The capture's view size, or whatever else a run was begun with; see ``optimizer.learning_rates`` [scene
+        unit: The capture's view size, or whatever else a run was begun with; see ``TrainConfig.means_unit`` [scene
             units].
 
     Attributes:
@@ -135,7 +135,7 @@ class Step:
             time_noise=sample.time_noise,
             dropout_seed=sample.dropout_seed,
             scales={**weights, "psnr": DECIBELS, STEPS: 1.0},
-            learning_rates=optim.learning_rates(self.config.optim, self.unit, plan),
+            learning_rates=optim.learning_rates(self.config.optim, self.config.means_unit(self.unit), plan),
         )
         self.views.select(sample.view)
         if self._graphs is None:
