@@ -13,7 +13,7 @@ from warpgs.data.lens import Lens
 
 from .cameras.intrinsics import read_intrinsics
 from .cameras.posed_frames import load_posed_frames
-from .cameras.recovered import Cameras, NoCamerasError
+from .cameras.recovered import Cameras, NoCamerasError, require_frames
 from .cameras.sfm import Settings, recover_cameras
 from .checks import check_count
 from .depth.estimate import add_depth, depth_files
@@ -41,6 +41,9 @@ FEATURE_BYTES, MASK_BYTES, IMAGE_BYTES, DEPTH_BYTES = 5, 1, 5, 2
 
 BACKGROUND = "background"
 """Name of the step that finds what does not move with the background, and of the folder with its masks."""
+
+MIN_KEPT = 0.8
+"""Minimum fraction of the frames of the first pass that keep a camera in the second, for the second to be used."""
 
 STILL_FOCAL = 1.0
 """Focal length over the longer side of a camera on a tripod whose focal length is unknown: 53° across."""
@@ -105,9 +108,9 @@ class Steps:
                 return _save(first, path, first.names)
             try:
                 found = self._reconstruct(first.names, settings)
-                if len(found.names) == len(first.names):
+                if len(found.names) >= MIN_KEPT * len(first.names):
                     return _save(replace(found, has_held_focal=first.has_held_focal), path, first.names)
-                reason = "fewer frames were registered"
+                reason = f"only {len(found.names)} of {len(first.names)} frames have a camera"
             except NoCamerasError as error:
                 reason = str(error)
             # The static regions were sufficient for the first pass; its cameras are as good as without masks.
@@ -251,7 +254,9 @@ class Steps:
     def _reconstruct(self, names: list[str], settings: Settings) -> Cameras:
         self._require_space(FEATURE_BYTES)
         quiet = self.journal.quiet
-        return recover_cameras(self.frames.folder, names, self.journal.work / "colmap", settings, quiet)
+        found = recover_cameras(self.frames.folder, names, self.journal.work / "colmap", settings, quiet)
+        require_frames(len(found.names), len(self.frames.names))  # ``names`` may already be a part of them
+        return found
 
     def _require_space(self, bytes_per_pixel: int) -> None:
         self.journal.require_space(self.frames.megabytes(bytes_per_pixel))

@@ -9,10 +9,7 @@ import pycolmap
 
 from warpgs.data.colmap import lens_of
 
-from .recovered import Cameras, NoCamerasError
-
-MIN_REGISTERED = 0.5
-"""Minimum fraction of the frames that get a camera."""
+from .recovered import Cameras, NoCamerasError, require_frames
 
 MIN_ANGLE = 1.0
 """Minimum of the median triangulation angle [degrees]; with less, depth is undetermined."""
@@ -44,12 +41,7 @@ def cameras_of_model(model: Any, names: list[str], weak_features: bool) -> Camer
         NoCamerasError: If there are too few, or the camera hardly moves.
     """
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
-    if len(images) < max(MIN_REGISTERED * len(names), 3):
-        raise NoCamerasError(
-            f"cameras were found for only {len(images)} of {len(names)} frames: too much moves, the camera moves too "
-            "fast, or the frames have too little texture; try more frames (--fps, --count), a slower part of the "
-            "video, or masks of what moves (--masks FOLDER)"
-        )
+    require_frames(len(images), len(names))
     poses = np.array([i.cam_from_world().matrix() for i in images])
     try:
         lens = lens_of(images[0].camera)

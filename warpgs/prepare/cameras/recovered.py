@@ -24,8 +24,22 @@ MISLED = 0.7
 """Reprojection error without dynamic regions over that with them, below which dynamic objects misled the cameras."""
 
 
+MIN_REGISTERED = 0.5
+"""Minimum fraction of the frames that get a camera."""
+
+
 class NoCamerasError(ValueError):
     """The cameras cannot be recovered from the frames."""
+
+
+def require_frames(count: int, of: int) -> None:
+    """Raises NoCamerasError if fewer than ``MIN_REGISTERED`` of the frames have a camera, or fewer than three."""
+    if count < max(MIN_REGISTERED * of, 3):
+        raise NoCamerasError(
+            f"cameras were found for only {count} of {of} frames: too much moves, the camera moves too fast, or the "
+            "frames have too little texture; try more frames (--fps, --count), a slower part of the video, or masks of "
+            "what moves (--masks FOLDER)"
+        )
 
 
 def are_apart(centers: Float[np.ndarray, "F 3"]) -> bool:
