@@ -202,7 +202,7 @@ def test_views_are_in_the_order_of_time_not_in_that_of_names(capture):
     times = zip(names, (0.5, 0.0, 0.2), strict=True)
     moved = {name: dataclasses.replace(capture.cameras[name], time=time) for name, time in times}
     views = Views(capture.assuming("static").split(names, ()).with_cameras(moved), CPU, PLENTY)
-    assert views.by_time == [1, 2, 0]
+    assert views.in_time == [1, 2, 0]
 
 
 @pytest.mark.parametrize("resident_bytes", [0, PLENTY])

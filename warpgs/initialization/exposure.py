@@ -34,7 +34,7 @@ def exposure_gains(views: Views) -> Float[Tensor, "T 3"]:
         [T, 3] factors of red, green and blue, in the order of the views; their median over frames is 1.
     """
     logs, log, before = torch.zeros(len(views), 3, dtype=torch.float32), torch.zeros(3, dtype=torch.float32), None
-    for k, frame in zip(views.by_time, views.frames(views.by_time), strict=True):
+    for k, frame in zip(views.in_time, views.frames(views.in_time), strict=True):
         after = _log_intensities(frame)
         if before is not None:
             log = log + _jump(before, after)

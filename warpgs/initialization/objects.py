@@ -72,7 +72,7 @@ def num_cut_off(objects: Sequence[MovingObject]) -> int | None:
 
 def find_all_objects(views: Views) -> list[MovingObject]:
     """The objects that the masks show by time, then those backward in time: what parts later is told apart before."""
-    order = views.by_time
+    order = views.in_time
     return [item for indices in (order, order[::-1]) for item in find_objects(views, indices)]
 
 

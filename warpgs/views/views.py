@@ -152,7 +152,7 @@ class Views:
             yield graphs.run("view", lambda: work(self.selected())) if graphs else work(self.selected())
 
     @property
-    def by_time(self) -> list[int]:
+    def in_time(self) -> list[int]:
         """The indices of all views in the order of time."""
         return sorted(range(len(self)), key=lambda index: self._camera(index).time)
 
