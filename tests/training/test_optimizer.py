@@ -10,15 +10,14 @@ from tests.reference.adam import adam
 from tests.scenes import error, generator, random_gaussians
 from warpgs.model.gaussians import PARAMETERS
 from warpgs.model.scene import SplitScene
+from warpgs.training.density.operations import gather, reset_moments
 from warpgs.training.optimizer import (
     BRANCHES,
     GROUPS,
     RatePlan,
     exponential,
-    gather,
     learning_rates,
     make_optimizer,
-    reset_moments,
 )
 
 NETWORK = plain.model(position_bands=1, time_bands=1, depth=2, width=3)

@@ -95,7 +95,7 @@ class Gaussians(nn.Module):
     def gather(self, parents: Int64[Tensor, " M"]) -> None:
         """Replaces the Gaussians by copies of ``parents``, which are [M] indices.
 
-        Gradients are dropped. ``training.optimizer.gather`` also updates the optimizer's state.
+        Gradients are dropped. ``training.density.operations.gather`` also updates the optimizer's state.
         """
         for parameter in self.parameters():
             parameter.data = parameter.data[parents]

@@ -12,11 +12,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int64
 from torch import Tensor, nn
 
 from warpgs.config import OptimConfig
-from warpgs.model.gaussians import PARAMETERS, Gaussians
+from warpgs.model.gaussians import PARAMETERS
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
@@ -156,43 +155,3 @@ def copy_first(parameters: Sequence[nn.Parameter], optimizer: Adam | None = None
             state.update({name: torch.empty_like(parameter) for name in MOMENTS if name in state})
         for tensor in (parameter.data, *(state[name] for name in MOMENTS if name in state)):
             ranks.copy_first_(tensor)
-
-
-@torch.no_grad()
-def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], num_kept: int) -> None:
-    """Replaces Gaussians by copies of ``parents``, together with Adam's moments.
-
-    Args:
-        optimizer: From ``make_optimizer``.
-        gaussians: Changed in place.
-        parents: [M] indices of Gaussians.
-        num_kept: Number of Gaussians, from the first, that keep their parents' moments; the others' start at 0.
-    """
-    gaussians.gather(parents)
-    for parameter in gaussians.parameters():
-        state = optimizer.state.get(parameter, {})
-        for name in MOMENTS:
-            if name in state:
-                moments = state[name][parents]
-                moments[num_kept:] = 0.0
-                state[name] = moments
-
-
-@torch.no_grad()
-def append(optimizer: Adam, gaussians: Gaussians, added: Gaussians) -> None:
-    """Appends Gaussians, of the same degree of spherical harmonics and from any device; their moments start at 0."""
-    gaussians.append(added)
-    for name, parameter in gaussians.named_parameters():
-        state = optimizer.state.get(parameter, {})
-        for moment in MOMENTS:
-            if moment in state:
-                state[moment] = torch.cat([state[moment], state[moment].new_zeros(getattr(added, name).shape)])
-
-
-@torch.no_grad()
-def reset_moments(optimizer: Adam, parameter: nn.Parameter) -> None:
-    """Sets Adam's moments of a parameter to 0, because its values were replaced."""
-    state = optimizer.state.get(parameter, {})
-    for name in MOMENTS:
-        if name in state:
-            state[name].zero_()

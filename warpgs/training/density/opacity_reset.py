@@ -11,10 +11,10 @@ from warpgs.config import RenderSettings
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 from warpgs.rendering import opacities_on_screen
-from warpgs.training import optimizer as optim
 from warpgs.training.schedule import Phase
 
 from .adaptation import Adaptation
+from .operations import reset_moments
 
 RESET_OPACITY = 0.01
 """Maximum opacity on screen after a reset (3DGS)."""
@@ -41,7 +41,7 @@ def reset_opacities(
     branches = (scene.static, scene.dynamic)
     for gaussians, limits in zip(branches, highest.split([len(gaussians) for gaussians in branches]), strict=True):
         gaussians.logit_opacities.clamp_(max=limits)
-        optim.reset_moments(optimizer, gaussians.logit_opacities)
+        reset_moments(optimizer, gaussians.logit_opacities)
 
 
 def reset(at: Adaptation) -> None:

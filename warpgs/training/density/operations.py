@@ -4,11 +4,11 @@ import math
 
 import torch
 from jaxtyping import Float, Int64
-from torch import Tensor
+from torch import Tensor, nn
 
 from warpgs.model.gaussians import Gaussians
 from warpgs.ops.adam import Adam
-from warpgs.training import optimizer as optim
+from warpgs.training.optimizer import MOMENTS
 
 MIN_OPACITY = 0.005
 """Opacity below which Gaussians are removed (3DGS)."""
@@ -18,10 +18,50 @@ SPLIT_SHRINK = 1.6
 
 
 @torch.no_grad()
+def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], num_kept: int) -> None:
+    """Replaces Gaussians by copies of ``parents``, together with Adam's moments.
+
+    Args:
+        optimizer: From ``make_optimizer``.
+        gaussians: Changed in place.
+        parents: [M] indices of Gaussians.
+        num_kept: Number of Gaussians, from the first, that keep their parents' moments; the others' start at 0.
+    """
+    gaussians.gather(parents)
+    for parameter in gaussians.parameters():
+        state = optimizer.state.get(parameter, {})
+        for name in MOMENTS:
+            if name in state:
+                moments = state[name][parents]
+                moments[num_kept:] = 0.0
+                state[name] = moments
+
+
+@torch.no_grad()
+def append(optimizer: Adam, gaussians: Gaussians, added: Gaussians) -> None:
+    """Appends Gaussians, of the same degree of spherical harmonics and from any device; their moments start at 0."""
+    gaussians.append(added)
+    for name, parameter in gaussians.named_parameters():
+        state = optimizer.state.get(parameter, {})
+        for moment in MOMENTS:
+            if moment in state:
+                state[moment] = torch.cat([state[moment], state[moment].new_zeros(getattr(added, name).shape)])
+
+
+@torch.no_grad()
+def reset_moments(optimizer: Adam, parameter: nn.Parameter) -> None:
+    """Sets Adam's moments of a parameter to 0, because its values were replaced."""
+    state = optimizer.state.get(parameter, {})
+    for name in MOMENTS:
+        if name in state:
+            state[name].zero_()
+
+
+@torch.no_grad()
 def remove(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"]) -> None:
     """Removes Gaussians; the others keep their order."""
     kept = _others(gaussians, indices)
-    optim.gather(optimizer, gaussians, kept, num_kept=len(kept))
+    gather(optimizer, gaussians, kept, num_kept=len(kept))
 
 
 @torch.no_grad()
@@ -29,7 +69,7 @@ def clone(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"]) -
     """Appends copies of Gaussians; the moments of the copies start at 0."""
     num = len(gaussians)
     parents = torch.cat([torch.arange(num, device=indices.device), indices])
-    optim.gather(optimizer, gaussians, parents, num_kept=num)
+    gather(optimizer, gaussians, parents, num_kept=num)
 
 
 @torch.no_grad()
@@ -41,7 +81,7 @@ def split(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"], g
     if not len(indices):
         return
     kept = _others(gaussians, indices)
-    optim.gather(optimizer, gaussians, torch.cat([kept, indices.repeat(2)]), num_kept=len(kept))
+    gather(optimizer, gaussians, torch.cat([kept, indices.repeat(2)]), num_kept=len(kept))
     first = len(kept)
     scales = gaussians.scales[first:]
     noise = torch.randn(scales.shape, dtype=torch.float32, generator=generator).to(scales.device) * scales

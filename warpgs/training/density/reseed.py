@@ -24,11 +24,11 @@ from warpgs.initialization.point_cloud import gaussians_at
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
-from warpgs.training import optimizer as optim
 from warpgs.training.schedule import Phase
 from warpgs.views.views import View, Views
 
 from .adaptation import Adaptation
+from .operations import append
 
 MAX_LOST_ALPHA = 0.1
 """Alpha of the dynamic image below which a dynamic pixel counts as lost; opacities that were just reset are above it
@@ -136,7 +136,7 @@ def reseed(at: Adaptation) -> None:
         added = gaussians_that_show(found, scene, views, config, at.capture.view_size)
         if not len(added) + len(scene.dynamic):
             added = gaussians_in_box(at.capture, count, config, generator)
-        optim.append(at.optimizer, scene.dynamic, added)
+        append(at.optimizer, scene.dynamic, added)
         lost = f"{fraction:.0%} of the dynamic pixels show no dynamic Gaussian"
         limit = ", as many as --densify.max-gaussians allows" if count == capacity else ""
         at.log(f"{lost}; {len(added):,} added there{limit}")
