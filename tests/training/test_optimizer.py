@@ -120,7 +120,7 @@ def test_all_have_the_values_of_their_parents_and_only_kept_gaussians_their_mome
     gaussians = getattr(scene, branch)
     values = {name: getattr(gaussians, name).detach().clone() for name in PARAMETERS}
     before = {name: dict(optimizer.state[getattr(gaussians, name)]) for name in PARAMETERS}
-    gather(optimizer, gaussians, torch.tensor([3, 0, 1, 1, 3]), num_kept=3)
+    gather(gaussians, optimizer, torch.tensor([3, 0, 1, 1, 3]), num_kept=3)
     for name in PARAMETERS:
         after = optimizer.state[getattr(gaussians, name)]
         assert torch.equal(getattr(gaussians, name), values[name][[3, 0, 1, 1, 3]])
@@ -134,7 +134,7 @@ def test_all_have_the_values_of_their_parents_and_only_kept_gaussians_their_mome
 def test_resizing_does_not_change_the_next_steps_of_kept_gaussians():
     (resized, its_optimizer), (untouched, optimizer) = trained(), trained()
     kept = torch.tensor([4, 1, 2])
-    gather(its_optimizer, resized.static, torch.cat([kept, kept[:1]]), num_kept=3)
+    gather(resized.static, its_optimizer, torch.cat([kept, kept[:1]]), num_kept=3)
     for seed in (10, 11):
         gradients = random_gradients(untouched, seed)
         shared = {
@@ -153,7 +153,7 @@ def test_resizing_one_branch_leaves_everything_else_unchanged():
     others = {name: p for name, p in scene.named_parameters() if not name.startswith("static.")}
     before = {name: {k: v.clone() for k, v in optimizer.state[p].items()} for name, p in others.items()}
     values = {name: p.detach().clone() for name, p in others.items()}
-    gather(optimizer, scene.static, torch.tensor([0]), num_kept=1)
+    gather(scene.static, optimizer, torch.tensor([0]), num_kept=1)
     for name, parameter in others.items():
         assert torch.equal(parameter, values[name])
         assert all(torch.equal(optimizer.state[parameter][key], value) for key, value in before[name].items())
@@ -162,7 +162,7 @@ def test_resizing_one_branch_leaves_everything_else_unchanged():
 def test_resizing_before_the_first_step_needs_no_moments():
     scene = make_scene()
     optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.01))
-    gather(optimizer, scene.static, torch.tensor([1, 1, 1]), num_kept=1)
+    gather(scene.static, optimizer, torch.tensor([1, 1, 1]), num_kept=1)
     before = scene.static.means.detach().clone()
     step(scene, optimizer, {name: torch.ones_like(p) for name, p in scene.named_parameters()})
     assert error(before - scene.static.means.detach(), torch.full((3, 3), 0.01)) < 1e-5
@@ -170,7 +170,7 @@ def test_resizing_before_the_first_step_needs_no_moments():
 
 def test_training_continues_after_all_gaussians_were_removed():
     scene, optimizer = trained()
-    gather(optimizer, scene.dynamic, torch.zeros(0, dtype=torch.int64), num_kept=0)
+    gather(scene.dynamic, optimizer, torch.zeros(0, dtype=torch.int64), num_kept=0)
     step(scene, optimizer, random_gradients(scene, 9))
     assert len(scene.dynamic) == 0
     assert optimizer.state[scene.dynamic.sh_rest]["exp_avg"].shape == (0, 15, 3)

@@ -46,7 +46,7 @@ def lose_half(trainer):
     """Removes the dynamic Gaussians of one half of the scene."""
     x = trainer.scene.dynamic.means[:, 0]
     kept = (x > x.median()).nonzero()[:, 0]
-    operations.gather(trainer.step.optimizer, trainer.scene.dynamic, kept, len(kept))
+    operations.gather(trainer.scene.dynamic, trainer.step.optimizer, kept, len(kept))
 
 
 def test_lost_are_the_dynamic_pixels_that_dynamic_gaussians_alone_leave_transparent(trainer):
@@ -103,7 +103,7 @@ def test_appended_gaussians_start_without_moments_and_the_others_keep_theirs(tra
     optimizer.step()
     before = {name: optimizer.state[getattr(dynamic, name)]["exp_avg"].clone() for name in PARAMETERS}
     num, added = len(dynamic), Gaussians.empty(3, 1)
-    operations.append(optimizer, dynamic, added)
+    operations.append(dynamic, optimizer, added)
     assert len(dynamic) == num + 3
     for name in PARAMETERS:
         moments = optimizer.state[getattr(dynamic, name)]["exp_avg"]

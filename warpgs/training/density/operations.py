@@ -18,12 +18,12 @@ SPLIT_SHRINK = 1.6
 
 
 @torch.no_grad()
-def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], num_kept: int) -> None:
+def gather(gaussians: Gaussians, optimizer: Adam, parents: Int64[Tensor, " M"], num_kept: int) -> None:
     """Replaces Gaussians by copies of ``parents``, together with Adam's moments.
 
     Args:
-        optimizer: From ``make_optimizer``.
         gaussians: Changed in place.
+        optimizer: From ``optimizer.make_optimizer``.
         parents: [M] indices of Gaussians.
         num_kept: Number of Gaussians, from the first, that keep their parents' moments; the others' start at 0.
     """
@@ -38,7 +38,7 @@ def gather(optimizer: Adam, gaussians: Gaussians, parents: Int64[Tensor, " M"], 
 
 
 @torch.no_grad()
-def append(optimizer: Adam, gaussians: Gaussians, added: Gaussians) -> None:
+def append(gaussians: Gaussians, optimizer: Adam, added: Gaussians) -> None:
     """Appends Gaussians, of the same degree of spherical harmonics and from any device; their moments start at 0."""
     gaussians.append(added)
     for name, parameter in gaussians.named_parameters():
@@ -61,7 +61,7 @@ def reset_moments(optimizer: Adam, parameter: nn.Parameter) -> None:
 def remove(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"]) -> None:
     """Removes Gaussians; the others keep their order."""
     kept = _others(gaussians, indices)
-    gather(optimizer, gaussians, kept, num_kept=len(kept))
+    gather(gaussians, optimizer, kept, num_kept=len(kept))
 
 
 @torch.no_grad()
@@ -69,7 +69,7 @@ def clone(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"]) -
     """Appends copies of Gaussians; the moments of the copies start at 0."""
     num = len(gaussians)
     parents = torch.cat([torch.arange(num, device=indices.device), indices])
-    gather(optimizer, gaussians, parents, num_kept=num)
+    gather(gaussians, optimizer, parents, num_kept=num)
 
 
 @torch.no_grad()
@@ -81,7 +81,7 @@ def split(gaussians: Gaussians, optimizer: Adam, indices: Int64[Tensor, " K"], g
     if not len(indices):
         return
     kept = _others(gaussians, indices)
-    gather(optimizer, gaussians, torch.cat([kept, indices.repeat(2)]), num_kept=len(kept))
+    gather(gaussians, optimizer, torch.cat([kept, indices.repeat(2)]), num_kept=len(kept))
     first = len(kept)
     scales = gaussians.scales[first:]
     noise = torch.randn(scales.shape, dtype=torch.float32, generator=generator).to(scales.device) * scales

@@ -136,7 +136,7 @@ def reseed(at: Adaptation) -> None:
         added = gaussians_that_show(found, scene, views, config, at.capture.view_size)
         if not len(added) + len(scene.dynamic):
             added = gaussians_in_box(at.capture, count, config, generator)
-        append(at.optimizer, scene.dynamic, added)
+        append(scene.dynamic, at.optimizer, added)
         lost = f"{fraction:.0%} of the dynamic pixels show no dynamic Gaussian"
         limit = ", as many as --densify.max-gaussians allows" if count == capacity else ""
         at.log(f"{lost}; {len(added):,} added there{limit}")
