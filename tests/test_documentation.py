@@ -143,7 +143,7 @@ def test_every_option_is_on_the_page_of_options(pages):
             assert f"| {name} | {default} | {meaning} |" in text
     assert "| `--exposure`, `--no-exposure` | yes |" in text
     assert "| `--model.half`, `--model.no-half` | yes |" in text
-    assert "| `--try-masks` | no | yes | yes | no |" in text
+    assert "| `--assume` | `masks` | `auto` | `auto` | `masks` |" in text
     assert "| `--quiet`, `--no-quiet` | no |" in text
     assert "| `--densify.max-gaussians INT` | `3000000` |" in text
     assert "| `--schedule.joint-from` | none | `0` | `0` | `0` |" in text

@@ -83,7 +83,6 @@ PAPER = {
     "no such thing in the paper": {
         "optim.poses": 0.0,
         "exposure": False,
-        "try_masks": False,
         "antialias": False,
         "densify.weakest": 0.0,
         "densify.max_elongation": 0.0,

@@ -96,10 +96,10 @@ def test_a_sweep_may_name_a_colour(tmp_path):
     assert parse(arguments(cell.config)).background == (0.1, 0.2, 0.3)
 
 
-@pytest.mark.parametrize("options", [{}, {"try_masks": True}])
+@pytest.mark.parametrize("options", [{}, {"assume": "auto"}])
 def test_cells_follow_the_masks_unless_the_sweep_says_otherwise(options, tmp_path):
     [cell] = plan(spec(options=options), out=tmp_path)
-    assert cell.config.try_masks == bool(options)
+    assert cell.config.assume == options.get("assume", "masks")
 
 
 def test_two_cells_with_one_name_are_refused(tmp_path):

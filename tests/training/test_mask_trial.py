@@ -21,7 +21,7 @@ from warpgs.training.train import train
 LENGTH = 60
 pytestmark = pytest.mark.usefixtures("quickly")
 
-CONFIG = dataclasses.replace(tiny.CONFIG, preset="best", omit=("app",), try_masks=True, background="black")
+CONFIG = dataclasses.replace(tiny.CONFIG, preset="best", omit=("app",), assume="auto", background="black")
 
 
 @pytest.fixture(autouse=True)
@@ -81,7 +81,7 @@ def test_masks_are_used_unless_none_are_better(folder, qualities, without, assum
     assert f"30.0 dB with the masks and {without:.1f} dB without" in lines[-1]
 
 
-@pytest.mark.parametrize("changes", [{"assume": "static"}, {"try_masks": False}])
+@pytest.mark.parametrize("changes", [{"assume": "static"}, {"assume": "masks"}])
 def test_masks_that_are_not_in_question_are_not_tried(folder, qualities, changes):
     qualities["dynamic"] = 40.0
     config = dataclasses.replace(CONFIG, **changes)
@@ -94,7 +94,8 @@ def test_given_masks_and_few_frames_are_not_tried(folder, qualities):
     few, given = capture.split(capture.train[:15], ()), load_capture(folder)
     given.estimated_masks = False
     for other in (few, given):
-        assert with_trusted_masks(CONFIG, other, print, quiet=True) == (CONFIG, {})
+        following = dataclasses.replace(CONFIG, assume="masks")
+        assert with_trusted_masks(CONFIG, other, print, quiet=True) == (following, {})
 
 
 def test_runs_that_are_hardly_longer_are_not_tried(folder, qualities, monkeypatch):
@@ -174,7 +175,7 @@ def test_metrics_have_the_results_of_the_trial_also_after_the_run_was_resumed(fo
 
 def test_metrics_without_a_trial_do_not_mention_it(folder, qualities, monkeypatch, tmp_path):
     monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
-    train(dataclasses.replace(CONFIG, data=folder, out=tmp_path / "run", try_masks=False))
+    train(dataclasses.replace(CONFIG, data=folder, out=tmp_path / "run", assume="masks"))
     assert "mask_trial" not in (tmp_path / "run" / "metrics.json").read_text()
     assert not (tmp_path / "run" / "mask_trial.json").exists()
 

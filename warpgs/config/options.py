@@ -60,11 +60,10 @@ class TrainConfig:
     """Components of the paper to omit (Table 4): depth-aware pretraining (dap; depth is still compared),
     visibility-driven pruning (vdp), the appearance network of static Gaussians (app), stage II. Iterations of dap and
     stage2 go to stage I."""
-    assume: Literal["masks", "static", "dynamic"] = "masks"
-    """What moves: what the masks mark, nothing (static), or everything (dynamic)."""
-    try_masks: bool = True
-    """Try out masks that `prepare` made in two short trainings, with them and without, before runs that are longer, and
-    take everything as dynamic if held-out frames are better without."""
+    assume: Literal["auto", "masks", "static", "dynamic"] = "auto"
+    """What moves: what the masks mark, nothing (static), or everything (dynamic). With auto it is the masks, unless
+    they are estimates of `prepare` and two short trainings, before runs that are longer, are better on held-out frames
+    with everything dynamic."""
     background: BackgroundName | tuple[float, float, float] = "mean"
     """Colour behind all Gaussians: that of the capture, which is white if D-NeRF's images have alpha, else black; the
     same, but the mean colour of the training frames instead of black (mean); or red, green and blue in [0, 1]."""
@@ -105,6 +104,11 @@ class TrainConfig:
     def render_settings(self) -> RenderSettings:
         """How all images of the run are rendered."""
         return RenderSettings(antialias=self.antialias, max_alpha=self.max_alpha)
+
+    @property
+    def assumption(self) -> Literal["masks", "static", "dynamic"]:
+        """What is taken to move, unless a trial says something else."""
+        return "masks" if self.assume == "auto" else self.assume
 
     def freezes(self, part: Literal["geometry", "appearance"]) -> bool:
         """Whether stage II no longer optimizes this part of static Gaussians."""

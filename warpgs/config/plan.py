@@ -30,6 +30,7 @@ class Plan(TrainConfig):
     """
 
     iterations: None = None
+    assume: Literal["masks", "static", "dynamic"] = "masks"
     device: Device = field(kw_only=True)
     background: Background = field(kw_only=True)
     branches_in_stage2: bool = field(kw_only=True)
@@ -39,7 +40,7 @@ class Plan(TrainConfig):
     def of(config: TrainConfig, device: Device, background: Background, branches_in_stage2: bool) -> "Plan":
         """The plan of a config whose schedule is rescaled already."""
         values = {name.name: getattr(config, name.name) for name in dataclasses.fields(TrainConfig)}
-        values |= {"device": device, "background": background, "iterations": None}
+        values |= {"device": device, "background": background, "iterations": None, "assume": config.assumption}
         in_views = config.densify.unit == "pixel"
         return Plan(**values, branches_in_stage2=branches_in_stage2, means_in_views=in_views)
 

@@ -12,7 +12,7 @@ PAPER = replace(
     BEST,
     preset="paper",
     undistort=False,
-    try_masks=False,
+    assume="masks",
     background="capture",
     frozen="all",
     exposure=False,
@@ -117,7 +117,7 @@ PATIENT = replace(
 QUICK = replace(
     PATIENT,
     preset="quick",
-    try_masks=False,  # a trial is as long as two trainings of this preset
+    assume="masks",  # a trial is as long as two trainings of this preset
     model=replace(PATIENT.model, time_bands=4, sh_degree=1, max_static_points=4_000, dynamic_points=1_500),
     densify=replace(PATIENT.densify, gradient=4e-4, max_gaussians=10_000),
     schedule=replace(

@@ -28,7 +28,7 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
         notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} frames determine no more")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
     branches = loss.branches_in_stage2 != "no"
-    if loss.branches_in_stage2 == "given-masks" and capture.assuming(config.assume).uses_estimated_masks:
+    if loss.branches_in_stage2 == "given-masks" and capture.assuming(config.assumption).uses_estimated_masks:
         notes.append("the masks are estimates: stage II compares the image of all Gaussians only, not each branch's")
         branches = False
     return Plan.of(config, choose_device(config.device), background, branches), notes

@@ -42,6 +42,7 @@ REMOVED: dict[str, Removed] = {
     "static_geometry": Removed("--frozen says what stage II keeps"),
     "masks": Removed(),
     **{f"masks.{kind}": Removed(f"it is --damage-masks {kind}:{size} now") for kind, size in DAMAGE.items()},
+    "try_masks": Removed("--assume auto tries masks out, --assume masks does not"),
     "vrig_factor": Removed("--factor is for these captures, too"),
     **{name: Removed(f"--omit {name} omits it") for name in COMPONENTS},
     "densify.depth_gradients": Removed(),
@@ -107,7 +108,6 @@ FORMER: dict[str, dict[str, Any]] = {
         "out": None,
         "preset": None,
         "resume": None,
-        "try_masks": False,
         "undistort": True,
     },
     "densify": {

@@ -176,7 +176,7 @@ def _cell(
     if is_builtin(data):
         parse_builtin(data)
     options = dataclasses.asdict(PRESETS[spec.preset])
-    options["try_masks"] = False  # all cells of a table follow the masks, unless the sweep says otherwise
+    options["assume"] = "masks"  # all cells of a table follow the masks, unless the sweep says otherwise
     for layer in (spec.options, variant.options, overrides):
         _update(options, layer)
     name = f"{scene}-{variant.name}-seed{seed}"

@@ -52,11 +52,13 @@ def with_trusted_masks(
         log: Receives what is tried and what follows.
         quiet: Whether to show no progress.
     """
-    if not _is_wanted(config, capture):
+    is_wanted = _is_wanted(config, capture)
+    config = dataclasses.replace(config, assume=config.assumption)
+    if not is_wanted:
         return config, {}
     start, small = time.perf_counter(), reduced_capture(capture, MAX_SIDE)
     length, of_run = TRIAL.schedule.num_iterations, config.schedule.num_iterations
-    log(f"the masks are estimates: two trainings of {length} iterations try them out (--no-try-masks omits them)")
+    log(f"the masks are estimates: two trainings of {length} iterations try them out (--assume masks omits them)")
     try:
         log(f"trial 1 of 2 before the {of_run} iterations of the run, with the masks:")
         following = held_out_psnr(config, small, "masks", quiet)
@@ -73,14 +75,14 @@ def with_trusted_masks(
     if not ranks.text_of_first("worse" if ignoring > following else ""):
         log(f"{found}: the masks are used")
         return config, trial
-    log(f"{found}: the masks are not used, everything is dynamic (--no-try-masks uses them all the same)")
+    log(f"{found}: the masks are not used, everything is dynamic (--assume masks uses them all the same)")
     return dataclasses.replace(config, assume="dynamic"), trial
 
 
 def _is_wanted(config: TrainConfig, capture: Capture) -> bool:
     """Whether there are estimated masks to try out, and the run is much longer than the trial."""
     is_long = config.schedule.num_iterations >= MIN_RELATIVE_LENGTH * TRIAL.schedule.num_iterations
-    is_asked = config.try_masks and capture.assuming(config.assume).uses_estimated_masks
+    is_asked = config.assume == "auto" and capture.assuming("masks").uses_estimated_masks
     return is_asked and is_long and len(capture.train) >= MIN_FRAMES
 
 

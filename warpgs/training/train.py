@@ -266,7 +266,7 @@ def _own_device(asked: Device | None) -> Device:
 
 def _checked(capture: Capture, config: TrainConfig, log: Log) -> Capture:
     """The capture, if it is fit to train on and the same on all ranks of torchrun, as the options are."""
-    require_fit(capture.assuming(config.assume), log)
+    require_fit(capture.assuming(config.assumption), log)
     if ranks.num_ranks() == 1:
         return capture
     ranks.require_same("the options", json.dumps(dataclasses.asdict(config), default=str).encode())
