@@ -1,7 +1,7 @@
 """Small random scenes away from all cut-offs, and comparisons of results."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -27,6 +27,16 @@ def make_camera(width: int = WIDTH, height: int = HEIGHT) -> Camera:
     viewmat[:3, 3] = torch.tensor([0.1, -0.2, 0.3])
     K = torch.tensor([[45.0, 0.0, 27.3], [0.0, 43.0, 16.1], [0.0, 0.0, 1.0]])
     return Camera(viewmat, K, width, height)
+
+
+def along_z(
+    focal: float, size: tuple[int, int], position: Sequence[float] = (0.0, 0.0, 0.0), time: float = 0.0
+) -> Camera:
+    """A camera that looks along z, with square pixels and its principal point in the middle of the image."""
+    viewmat = torch.eye(4)
+    viewmat[:3, 3] -= torch.tensor(position)
+    K = torch.tensor([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
+    return Camera(viewmat, K, *size, time)
 
 
 def make_splats(num: int = 60, seed: int = 3, channels: int | None = None, degree: int = 3) -> Splats:

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from tests.reference.render import render as reference
-from tests.scenes import as_doubles
-from warpgs.cameras import Camera
+from tests.scenes import along_z, as_doubles
 from warpgs.config import RenderSettings
 from warpgs.model.splats import Splats
 from warpgs.rendering import render
 
 WIDTH, HEIGHT, FOCAL, DEPTH = 480, 270, 400.0, 4.0
+CAMERA = along_z(FOCAL, (WIDTH, HEIGHT), (0.0, 0.0, -DEPTH))
 PIXEL = DEPTH / FOCAL
 THICKNESS = math.sqrt(0.3)
 """Standard deviation on screen [px] of a splat whose own is far below: the low-pass filter."""
@@ -32,13 +32,6 @@ def make_needle(elongation: float, angle: float) -> Splats:
     )
 
 
-def make_camera() -> Camera:
-    viewmat = torch.eye(4)
-    viewmat[2, 3] = DEPTH
-    K = torch.tensor([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
-    return Camera(viewmat, K, WIDTH, HEIGHT)
-
-
 def smooth_gradient() -> torch.Tensor:
     """[H, W, 3] gradient of the image that changes slowly, as the error of a blurred region does."""
     y, x = torch.meshgrid(torch.arange(HEIGHT) / HEIGHT, torch.arange(WIDTH) / WIDTH, indexing="ij")
@@ -48,7 +41,7 @@ def smooth_gradient() -> torch.Tensor:
 
 def gradients_of_needle(elongation: float, angle: float, antialias: bool) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Gradients of scales and quaternion: of the kernels, and of the reference in double precision."""
-    splats, camera, v_image = make_needle(elongation, angle), make_camera(), smooth_gradient()
+    splats, camera, v_image = make_needle(elongation, angle), CAMERA, smooth_gradient()
     splats.scales.requires_grad_()
     splats.quats.requires_grad_()
     rendering = render(splats, camera, torch.zeros(3), RenderSettings(antialias=antialias))
@@ -86,7 +79,7 @@ def test_the_gradient_of_the_rotation_of_a_needle_equals_the_reference(antialias
 
 @pytest.mark.parametrize("angle", ORIENTATIONS[::4])
 def test_a_needle_that_is_too_long_shrinks_to_the_length_of_its_target(angle):
-    camera, background = make_camera(), torch.zeros(3)
+    camera, background = CAMERA, torch.zeros(3)
     target = render(make_needle(40.0, angle), camera, background).joint.image
     needle = make_needle(200.0, angle)
     log_length = needle.scales[0, 0].log().requires_grad_()

@@ -4,19 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from warpgs.cameras import Camera
+from tests.scenes import along_z
 from warpgs.data.capture import Frame
 from warpgs.data.dynamic_regions import MAX_SIDE, dynamic_regions, is_cut, scaled_size, unknown_depth
 
 
 def frame_of(width: int, height: int, *boxes: tuple[slice, slice]) -> Frame:
     """A frame in which these boxes move."""
-    K = torch.tensor([[100.0, 0.0, width / 2], [0.0, 100.0, height / 2], [0.0, 0.0, 1.0]])
     static = torch.ones(height, width, dtype=torch.bool)
     for box in boxes:
         static[box] = False
     image = torch.zeros(height, width, 3, dtype=torch.uint8)
-    return Frame("000", Camera(torch.eye(4), K, width, height, 0.0), image, static)
+    return Frame("000", along_z(100.0, (width, height)), image, static)
 
 
 def test_regions_are_found_in_masks_of_a_maximum_side():

@@ -20,6 +20,7 @@ import torch
 
 from tests import tiny
 from tests.data.captures import write_png
+from tests.scenes import along_z
 from warpgs.cameras import Camera
 from warpgs.captures.opening import load_capture, open_capture
 from warpgs.data.capture import Capture, Frame
@@ -42,7 +43,7 @@ VAL = ("a", "b", "c")
 
 
 def frame(name, time, masks=True, covisible=False):
-    camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, W / 2], [0, 20.0, H / 2], [0, 0, 1]]), W, H, time)
+    camera = along_z(20.0, (W, H), time=time)
     static, seen = torch.ones(H, W, dtype=torch.bool), torch.zeros(H, W, dtype=torch.bool)
     static[:4], seen[:, :5] = False, True
     image = torch.randint(0, 256, (H, W, 3), dtype=torch.uint8)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from tests import plain, tiny
-from warpgs.cameras import Camera
+from tests.scenes import along_z
 from warpgs.captures.opening import load_capture
 from warpgs.data import dynamic_regions
 from warpgs.data.capture import Capture, Frame
@@ -56,12 +56,8 @@ def wall(depth: float = WALL) -> torch.Tensor:
 
 def capture_of(masks, points=None, images=None, **frames) -> Capture:
     """A capture of a camera that moves sideways, with dynamic masks [T, H, W]."""
-    K = torch.tensor([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
-    cameras = {}
-    for k in range(len(masks)):
-        viewmat = torch.eye(4)
-        viewmat[0, 3] = 1e-3 * k
-        cameras[f"{k:03d}"] = Camera(viewmat, K, WIDTH, HEIGHT, k / max(1, len(masks) - 1))
+    last, size = max(1, len(masks) - 1), (WIDTH, HEIGHT)
+    cameras = {f"{k:03d}": along_z(FOCAL, size, (-1e-3 * k, 0.0, 0.0), k / last) for k in range(len(masks))}
 
     def read(name: str) -> Frame:
         k = int(name)

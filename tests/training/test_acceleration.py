@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from tests import plain, tiny
-from tests.scenes import as_gaussians, generator, make_camera, make_splats, select
-from warpgs.cameras import Camera
+from tests.scenes import along_z, as_gaussians, generator, make_camera, make_splats, select
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.ops.dropout import MAX_SEED
@@ -19,7 +18,7 @@ from warpgs.training.losses import LossInputs
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
-CAMERA = Camera(torch.eye(4), torch.tensor([[400.0, 0.0, 240.0], [0.0, 400.0, 135.0], [0.0, 0.0, 1.0]]), 480, 270)
+CAMERA = along_z(400.0, (480, 270))
 
 
 def measured(paths, camera=CAMERA, num_static=0):

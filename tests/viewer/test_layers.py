@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
+from tests.scenes import along_z
 from warpgs.cameras import Camera
 from warpgs.model.splats import Splats
 from warpgs.viewer.layers import LAYERS, render_layer
 
 BLACK = [0, 0, 0]
-CAMERA = Camera(torch.eye(4), torch.tensor([[40.0, 0, 16], [0, 40.0, 12], [0, 0, 1]]), 32, 24)
+CAMERA = along_z(40.0, (32, 24))
 
 
 def splats(depths=(2.0, 4.0), is_dynamic=(False, True)):

@@ -10,8 +10,7 @@ from torch import nn
 
 from tests import plain, tiny
 from tests.reference.projection import project as reference
-from tests.scenes import error, generator, relative_error
-from warpgs.cameras import Camera
+from tests.scenes import along_z, error, generator, relative_error
 from warpgs.config import RenderSettings
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
@@ -25,18 +24,14 @@ NETWORK = plain.model(position_bands=1, time_bands=1, depth=1, width=2)
 PHASE = plain.phase(use_appearance=False, sh_degree=0)
 ANTIALIAS = RenderSettings(antialias=True)
 FOCAL, DEPTH, SIZE = 100.0, 2.0, (96, 80)
-K = torch.tensor([[FOCAL, 0.0, SIZE[0] / 2], [0.0, FOCAL, SIZE[1] / 2], [0.0, 0.0, 1.0]])
 STDS = torch.linspace(0.1, 2.0, 20)
 """Standard deviations on screen in the nearest view [px]."""
 
 
-def camera_at(x, z, time):
-    viewmat = torch.eye(4)
-    viewmat[0, 3], viewmat[2, 3] = -x, -z
-    return Camera(viewmat, K, *SIZE, time)
-
-
-NEAR, FAR, ASIDE = camera_at(0.0, 0.0, 0.0), camera_at(0.0, -1.5, 0.5), camera_at(0.8, 0.0, 1.0)
+NEAR, FAR, ASIDE = (
+    along_z(FOCAL, SIZE, position, time)
+    for position, time in (((0.0, 0.0, 0.0), 0.0), ((0.0, 0.0, -1.5), 0.5), ((0.8, 0.0, 0.0), 1.0))
+)
 """The last one shows a part of the Gaussians."""
 
 CAMERAS = [NEAR, FAR, ASIDE]
