@@ -6,6 +6,7 @@ import dataclasses
 import html.parser
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from tests.data.captures import edit_json
 from tests.errors import error_line
 from warpgs.captures.opening import load_capture
 from warpgs.cli import main
+from warpgs.command_line.version import version
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
 from warpgs.evaluation import evaluate_run
@@ -97,6 +99,11 @@ def test_the_report_lists_the_metrics_of_every_view(tmp_path, run):
     for view in read_runs([run])[0].views:
         assert view.name in page.words
         assert f"{view.values['psnr']:.2f}" in page.text
+
+
+def test_a_page_says_when_and_by_which_version_it_was_written():
+    (written,) = [words for words in Page(page([], [], "a title")).words if words.startswith("written")]
+    assert re.fullmatch(rf"written \d{{4}}-\d\d-\d\d \d\d:\d\d UTC by warpgs {re.escape(version())}", written)
 
 
 def test_the_report_has_a_chart_of_every_scalar(tmp_path, run):
@@ -496,13 +503,13 @@ def test_a_report_of_several_runs_shows_the_mean_that_it_orders_by_and_says_a_no
     runs = read_runs(folders)
     worst, _ = extremes(runs, 1, saved_views(runs[0]))
     strips = [saved_strips(own, worst, "nothing is rendered") for own in runs]
-    shown = Page(page(runs, [Gallery([0, 1, 2], worst, [], strips)], "written today"))
+    shown = Page(page(runs, [Gallery([0, 1, 2], worst, [], strips)]))
     known = [view.values["psnr"] for own in runs for view in own.views if view.name == worst[0]]
     assert f"mean {sum(known) / 3:.2f} dB" in shown.text
     assert "Ordered by the mean PSNR of the runs." in shown.text
     assert shown.text.count("only views whose images the evaluation saved: nothing is rendered") == 1
     strips[2] = saved_strips(runs[2], worst, "it is lost")
-    shown = Page(page(runs, [Gallery([0, 1, 2], worst, [], strips)], "written today"))
+    shown = Page(page(runs, [Gallery([0, 1, 2], worst, [], strips)]))
     assert "run, second: only views whose images the evaluation saved: nothing is rendered" in shown.text
     assert "third: only views whose images the evaluation saved: it is lost" in shown.text
 

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from warpgs.cameras import Camera, are_comparable
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between, grey_at, grey_levels
+from warpgs.data.resized import size_within
 from warpgs.data.sampling import evenly_spaced
 from warpgs.visualize.images import seen_from
 
@@ -69,7 +70,7 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
         The motion; None if too few pixels have texture and flow, the cameras are too far apart (``are_comparable``), or
         the images are too small for optical flow.
     """
-    size = _reduced_size(first.camera)
+    size = size_within(first.camera.size, COMPARED_SIDE)
     if min(*size, *second.camera.size) < MIN_SIDE or not are_comparable(first.camera, second.camera):
         return None
     a, (b, is_seen) = grey_at(first, size), _turned_like(first.camera, second, size)
@@ -161,14 +162,9 @@ def _turned_like(
     camera: Camera, frame: Frame, size: tuple[int, int]
 ) -> tuple[UInt8[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """A frame in grey as if its camera were turned like another one and had its lens; and where it shows anything."""
-    reduced = _reduced_size(frame.camera)
+    reduced = size_within(frame.camera.size, COMPARED_SIDE)
     turned, is_seen = seen_from(camera.resized(*size), grey_levels(frame, reduced), frame.camera.resized(*reduced))
     return even_contrast(turned), is_seen
-
-
-def _reduced_size(camera: Camera) -> tuple[int, int]:
-    factor = min(1.0, COMPARED_SIDE / max(camera.size))
-    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
 
 
 def _epipolar_distance(first: Camera, second: Camera, flow: Float[np.ndarray, "H W 2"]) -> Float[np.ndarray, "H W"]:

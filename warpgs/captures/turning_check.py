@@ -8,6 +8,7 @@ import numpy as np
 
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.optical_flow import grey_levels
+from warpgs.data.resized import size_within
 from warpgs.data.turning import MIN_MATCHES, Matches, Turning, find_turning
 
 from .findings import Finding
@@ -60,13 +61,11 @@ def turning_of(frames: Sequence[Frame]) -> tuple[Turning, Turning] | None:
     sizes = {frame.camera.size for frame in frames}
     if len(sizes) != 1:
         return None
-    width, height = sizes.pop()
-    factor = min(1.0, COMPARED_SIDE / max(width, height))
-    size = round(width * factor), round(height * factor)
+    size = size_within(sizes.pop(), COMPARED_SIDE)
     features = [_features(frame, size) for frame in frames]
     pairs = [p for p in itertools.combinations(range(len(frames)), 2) if p[1] - p[0] <= MAX_STEP]
     matches = [found for a, b in pairs if (found := _match(features[a], features[b])) is not None]
-    focal = factor * float(np.median([float(frame.camera.K[0, 0]) for frame in frames]))
+    focal = float(np.median([float(frame.camera.resized(*size).K[0, 0]) for frame in frames]))
     searched, known = find_turning(matches, size), find_turning(matches, size, focal)
     return None if searched is None or known is None else (searched, known)
 

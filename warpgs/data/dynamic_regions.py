@@ -11,6 +11,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 
 from .masks import connected_regions
+from .resized import size_within
 
 MAX_SIDE = 512
 """Regions are found in masks that are scaled down to this longer side [px]."""
@@ -28,8 +29,7 @@ known only where nothing moves."""
 
 def scaled_size(camera: Camera) -> tuple[int, int]:
     """(width, height) of the scaled mask of a camera's frame."""
-    factor = min(1.0, MAX_SIDE / max(camera.size))
-    return max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
+    return size_within(camera.size, MAX_SIDE)
 
 
 def dynamic_regions(static_mask: Bool[Tensor, "H W"], camera: Camera) -> list[Bool[np.ndarray, "h w"]]:

@@ -166,6 +166,11 @@ class Lens:
             x, y = found[:, 0].T.reshape(2, *np.shape(x))
         return x, y
 
+    def pixel_centers(self) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+        """u and v of the centre of every pixel."""
+        u, v = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        return u, v
+
     def unit_rays(self, positions: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 3"]:
         """[M, 3] unit vectors in the camera towards what the lens sees at positions [px from the corner]."""
         rays = np.stack([*self.unproject(positions[:, 0], positions[:, 1]), np.ones(len(positions))], 1)
@@ -242,8 +247,7 @@ def pinhole_matrix(lens: Lens) -> Float[np.ndarray, "3 3"]:
 
 @lru_cache(maxsize=4)
 def _maps(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    maps = lens.image(*lens.rays(filling_zoom(lens), u, v)) - 0.5
+    maps = lens.image(*lens.rays(filling_zoom(lens), *lens.pixel_centers())) - 0.5
     return maps[0].astype(np.float32), maps[1].astype(np.float32)
 
 

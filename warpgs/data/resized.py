@@ -127,19 +127,20 @@ def resize_mask(static: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[
     return dynamic == 0
 
 
+def size_within(size: tuple[int, int], max_side: int) -> tuple[int, int]:
+    """A (width, height) scaled down so that the longer side has at most ``max_side`` pixels."""
+    factor = min(1.0, max_side / max(size))
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
 def reduced_capture(capture: Capture, max_side: int) -> Capture:
     """The capture with frames of at most ``max_side`` pixels along the larger side; larger frames are averaged."""
-    cameras = {name: _reduced_camera(camera, max_side) for name, camera in capture.cameras.items()}
+    cameras = {name: c.resized(*size_within(c.size, max_side)) for name, c in capture.cameras.items()}
     return replace(capture, cameras=cameras, read=partial(_read_reduced, capture, cameras))
 
 
 def _read_reduced(capture: Capture, cameras: Mapping[str, Camera], name: str) -> Frame:
     return reduced_frame(capture.frame(name), cameras[name])
-
-
-def _reduced_camera(camera: Camera, max_side: int) -> Camera:
-    factor = min(1.0, max_side / max(camera.size))
-    return camera.resized(*(max(1, round(side * factor)) for side in camera.size))
 
 
 def reduced_frame(frame: Frame, camera: Camera) -> Frame:

@@ -61,7 +61,7 @@ def _read_taken(read: Callable[[str, Lens], Frame], lenses: Mapping[str, Lens], 
 @lru_cache(maxsize=4)
 def _wide_pinhole(lens: Lens) -> tuple[Float[np.ndarray, "3 3"], tuple[int, int], Float[np.ndarray, "H W 2"]]:
     """K and (width, height) of the wide camera, and ``TakenFrame.positions``."""
-    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    u, v = lens.pixel_centers()
     x, y = lens.unproject(u, v)
     positions = np.moveaxis(without_distortion(lens).image(x, y), 0, -1)
     error = np.abs(lens.image(x, y) - np.stack([u, v])).max()

@@ -4,8 +4,10 @@ import html
 import math
 import statistics
 from collections.abc import Iterable, Sequence
+from datetime import datetime, timezone
 from typing import Any, NamedTuple
 
+from warpgs.command_line.version import version
 from warpgs.evaluation.metrics import METRICS
 from warpgs.visualize.images import ERROR_RANGE
 
@@ -74,25 +76,23 @@ def text(value: object) -> str:
     return html.escape(str(value), quote=True)
 
 
-def page(
-    runs: Sequence[EvaluatedRun], galleries: Sequence[Gallery], origin: str, title: str = "", introduction: str = ""
-) -> str:
-    """The whole page.
+def page(runs: Sequence[EvaluatedRun], galleries: Sequence[Gallery], title: str = "", introduction: str = "") -> str:
+    """The whole page; it says when and by which version it was written.
 
     Args:
         runs: Runs, shown side by side; nothing is shown of them if there are none.
         galleries: Images of runs on the same views.
-        origin: A line that says when and by which program it was written.
         title: Title; the runs' labels if empty.
         introduction: HTML above everything about the runs.
     """
+    written = f"written {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC by warpgs {version()}"
     title = title or f"warpgs: {', '.join(run.label for run in runs)}"
     head = (
         f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{POLICY}">'
         f'<meta name="viewport" content="width=device-width"><title>{text(title)}</title><style>{STYLE}</style>'
     )
     sections = [
-        f"<h1>{text(title)}</h1><p class=note>{text(origin)}</p>",
+        f"<h1>{text(title)}</h1><p class=note>{text(written)}</p>",
         introduction,
     ]
     if runs:

@@ -2,10 +2,8 @@
 
 import statistics
 from collections.abc import Sequence
-from datetime import datetime, timezone
 from pathlib import Path
 
-from warpgs.command_line.version import version
 from warpgs.errors import one_line
 from warpgs.files import write_text
 
@@ -26,10 +24,8 @@ def write_report(options: Report) -> str:
         raise ValueError(f"--views must not be negative, got {options.views}")
     runs = read_runs(options.run_folders)
     galleries = [_gallery(options, runs, group) for group in groups(runs)] if options.views else []
-    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    origin = f"written {now} by warpgs {version()}"
     out = options.out or (options.run_folders[0] if len(runs) == 1 else Path()) / "report.html"
-    write_text(out, page(runs, [gallery for gallery in galleries if gallery.worst], origin))
+    write_text(out, page(runs, [gallery for gallery in galleries if gallery.worst]))
     return f"{out}: {out.stat().st_size / 1e6:.1f} MB"
 
 

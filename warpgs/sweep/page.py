@@ -1,10 +1,8 @@
 """The HTML report of a sweep: its tables, then the report of one run of each variant and capture."""
 
 from collections.abc import Sequence
-from datetime import datetime, timezone
 from pathlib import Path
 
-from warpgs.command_line.version import version
 from warpgs.files import write_text
 from warpgs.report.evaluated_run import groups, read_runs
 from warpgs.report.image_strips import saved_strips, saved_views
@@ -38,9 +36,7 @@ def write_page(path: Path, title: str, tables: Sequence[Table], notes: Sequence[
         if worst:
             strips = [saved_strips(run, [*worst, *best], REASON) for run in chosen]
             galleries.append(Gallery(group, worst, best, strips))
-    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    origin = f"written {now} by warpgs {version()}"
-    write_text(path, page(runs, galleries, origin, title=title, introduction=_introduction(tables, notes)))
+    write_text(path, page(runs, galleries, title=title, introduction=_introduction(tables, notes)))
 
 
 def _introduction(tables: Sequence[Table], notes: Sequence[str]) -> str:

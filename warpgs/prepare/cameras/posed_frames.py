@@ -163,5 +163,4 @@ def load_posed_frames(folder: Path, cameras: Cameras, side: int, max_factor: flo
 
 def pixel_rays(lens: Lens) -> Float[np.ndarray, "H W 2"]:
     """[H, W, 2] x, y on the plane z = 1 of the centre of every pixel of a distorted image."""
-    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    return np.stack(lens.unproject(u, v), -1).astype(np.float32)
+    return np.stack(lens.unproject(*lens.pixel_centers()), -1).astype(np.float32)

@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from warpgs.command_line.progress import progress
 from warpgs.data.images import MAX_PIXELS, MAX_SIDE
+from warpgs.data.resized import size_within
 from warpgs.data.video_frames import READ_LOCAL_FILES
 from warpgs.files import require_file
 
@@ -96,8 +97,7 @@ def _taken(time: Fraction, frame: Any, stream: Any, timeline: Timeline, selectio
 
 def _grey(frame: Any) -> UInt8[np.ndarray, "h w"]:
     """[h, w] grey levels of a frame, not rotated, at the size that sharpness is measured at."""
-    factor = min(1.0, SHARPNESS_SIDE / max(frame.width, frame.height))
-    width, height = max(1, round(frame.width * factor)), max(1, round(frame.height * factor))
+    width, height = size_within((frame.width, frame.height), SHARPNESS_SIDE)
     return frame.reformat(width=width, height=height, format="gray", interpolation="AREA").to_ndarray()
 
 
