@@ -223,13 +223,17 @@ SEVERAL_SIZES = pytest.mark.parametrize(
 )
 
 
+def layout_of(root, dataset=None):
+    return describe_layout(root, dataset or recognize(root), dataset)
+
+
 @SEVERAL_SIZES
 @pytest.mark.parametrize(("size", "layout"), [([480, 270], "nerfds"), ([1072, 1920], "hypernerf")])
 def test_images_of_the_released_size_tell_nerfds_from_hypernerf(tmp_path, images, masks, size, layout):
     root = write_sizes(tmp_path / "toy", images, masks)
     for path in (root / "camera").iterdir():
         captures.edit_json(path, image_size=size)
-    assert describe_layout(root) == recognize(root) == layout
+    assert layout_of(root) == recognize(root) == layout
 
 
 @SEVERAL_SIZES
@@ -237,14 +241,14 @@ def test_images_of_the_released_size_tell_nerfds_from_hypernerf(tmp_path, images
 def test_folders_of_cameras_that_only_nerfds_has_tell_it_from_hypernerf(tmp_path, images, masks, folder):
     root = write_sizes(tmp_path / "toy", images, masks)
     (root / folder).mkdir()
-    assert describe_layout(root) == recognize(root) == "nerfds"
+    assert layout_of(root) == recognize(root) == "nerfds"
 
 
 @SEVERAL_SIZES
 def test_a_capture_that_prepare_wrote_before_it_named_layouts_is_not_a_guess(tmp_path, images, masks):
     root = write_sizes(tmp_path / "toy", images, masks)
     (root / "prepare.json").write_text("{}")
-    assert describe_layout(root) == recognize(root) == "nerfds"
+    assert layout_of(root) == recognize(root) == "nerfds"
 
 
 @SEVERAL_SIZES
@@ -252,10 +256,10 @@ def test_a_layout_that_is_guessed_is_said_to_be_a_guess_until_it_is_named(tmp_pa
     root = write_sizes(tmp_path / "toy", images, masks)
     name = recognize(root)
     other = "hypernerf" if name == "nerfds" else "nerfds"
-    assert describe_layout(root) == f"{name}, a guess that --dataset {other} overrides"
-    assert describe_layout(root, other) == other
+    assert layout_of(root) == f"{name}, a guess that --dataset {other} overrides"
+    assert layout_of(root, other) == other
     captures.edit_json(root / "dataset.json", layout=other)
-    assert describe_layout(root) == other
+    assert layout_of(root) == other
 
 
 def test_a_guess_reads_well_in_the_summary_of_an_import(tmp_path, capsys):
@@ -283,7 +287,7 @@ def test_a_camera_that_is_not_json_does_not_keep_a_layout_from_being_recognized(
     root = write_sizes(tmp_path / "toy", ["1x", "4x"], ["1x"])
     for path in (root / "camera").iterdir():
         path.write_text("{")
-    assert describe_layout(root) == "nerfds, a guess that --dataset hypernerf overrides"
+    assert layout_of(root) == "nerfds, a guess that --dataset hypernerf overrides"
 
 
 def test_a_built_in_capture_is_imported_by_its_name(tmp_path, monkeypatch):
@@ -295,7 +299,7 @@ def test_a_built_in_capture_is_imported_by_its_name(tmp_path, monkeypatch):
 
 
 def test_a_layout_without_masks_is_not_a_guess(tmp_path):
-    assert describe_layout(write_sizes(tmp_path / "toy", ["1x", "4x"], [])) == "hypernerf"
+    assert layout_of(write_sizes(tmp_path / "toy", ["1x", "4x"], [])) == "hypernerf"
 
 
 @pytest.mark.parametrize("size", [None, "480×270", [[480], 270]])

@@ -5,6 +5,7 @@ import json
 import shutil
 import tarfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -49,6 +50,18 @@ def test_each_dataset_is_recognized_from_its_files_and_read_completely(tmp_path,
         assert (frame.static_mask is not None) == (dataset == "nerfds")
         assert (frame.inverse_depth is not None) == (dataset == "iphone" and name in train)
         assert (frame.covisible is not None) == (dataset == "iphone" and name in val)
+
+
+def test_each_loader_is_asked_at_most_once_until_a_capture_is_open_and_its_layout_known(iphone, monkeypatch):
+    asked = []
+
+    def counted(name, loader):
+        return SimpleNamespace(recognizes=lambda root: asked.append(name) or loader.recognizes(root), load=loader.load)
+
+    for name, loader in [*LOADERS.items()]:
+        monkeypatch.setitem(LOADERS, name, counted(name, loader))
+    assert load_capture(iphone).layout == "iphone"
+    assert len(asked) == len(set(asked))
 
 
 def test_hypernerf_captures_with_dychecks_additions_are_recognized(hypernerf):

@@ -10,7 +10,7 @@ from pathlib import Path
 from warpgs.config.builtin import is_builtin
 from warpgs.data.capture import Assumption, Capture
 from warpgs.data.dynamic_regions import DynamicCounts
-from warpgs.data.loaders import describe_layout, missing_capture
+from warpgs.data.loaders import missing_capture
 from warpgs.data.writer import REPORT
 from warpgs.files import read_json
 
@@ -20,7 +20,7 @@ from .findings import Finding, Report, UnfitCaptureError
 from .frames_check import check_counts, check_files
 from .masks_check import are_suspect, check_dynamic_depth, check_empty_masks, check_masks
 from .motion_check import Motion, check_motion, motions_of
-from .opening import capture_folder, load_capture
+from .opening import load_capture
 from .points_check import check_points
 from .turning_check import check_turning
 
@@ -52,7 +52,7 @@ def check_capture(
     sample = Sample(capture)
     contents = read_contents(capture, sample, deadline)
     findings = [
-        Finding("note", "layout", f"read as {describe_layout(capture_folder(root), dataset)}"),
+        Finding("note", "layout", f"read as {capture.layout}"),
         *check_counts(capture),
         *check_files(capture, contents),
     ]

@@ -10,12 +10,11 @@ from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens
-from warpgs.data.loaders import describe_layout
 from warpgs.data.units import SceneUnits, depth_range
 from warpgs.errors import command
 from warpgs.files import complete_or_absent
 
-from .opening import capture_folder, load_capture
+from .opening import load_capture
 
 FACTORS = (1, 2)
 """Downscaling factors of the images and masks that are written."""
@@ -59,9 +58,8 @@ def import_capture(
         counts = _write_frames(folder, capture, names, quiet=log is None)
         _write_index(folder, capture, names, val)
     if log is not None:
-        layout = describe_layout(capture_folder(source), dataset)
         log(
-            f"{source} is read as {layout}: {len(names)} frames, {counts[0]} with masks, "
+            f"{source} is read as {capture.layout}: {len(names)} frames, {counts[0]} with masks, "
             f"{counts[1]} with depth, {len(val)} for evaluation, {len(capture.points)} points"
         )
         _log_remarks(capture, renamed, log)

@@ -144,6 +144,7 @@ class Capture:
         estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
         background: Colour behind everything; black is also that of captures whose images show no background.
         time_source: Where the times of the cameras come from.
+        layout: Name of the layout of its files, for the middle of messages; empty if it was not read from files.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         conventions: What its files mean.
         is_builtin: Whether the package makes it: then no advice to change its files makes sense.
@@ -171,6 +172,7 @@ class Capture:
     is_builtin: bool = False
     notes: Sequence[str] = ()
     time_source: TimeSource = AS_GIVEN
+    layout: str = ""
     conventions: Conventions = field(default_factory=Conventions)
     assumption: Assumption = field(init=False)
     has_empty: bool = field(init=False)

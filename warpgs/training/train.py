@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from warpgs.captures.check import require_fit
-from warpgs.captures.opening import capture_folder, open_capture
+from warpgs.captures.opening import open_capture
 from warpgs.command_line.interrupt import Interrupt
 from warpgs.config import Device, TrainConfig, extended, scaled
 from warpgs.data.capture import Capture
-from warpgs.data.loaders import describe_layout
 from warpgs.errors import command, is_out_of_memory
 from warpgs.evaluation.evaluate import check_views
 from warpgs.evaluation.evaluate_run import evaluate_run
@@ -159,7 +158,7 @@ def _describe(trainer: Trainer, log: Log) -> None:
     """Logs what is trained where."""
     num_views = len(trainer.views)
     config, name = trainer.config, trainer.capture.name
-    layout = "" if config.data is None else f" (read as {describe_layout(capture_folder(config.data), config.dataset)})"
+    layout = "" if config.data is None else f" (read as {trainer.capture.layout})"
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     resumed = f", after iteration {trainer.iteration} of {trainer.protocol.num_iterations}" * (trainer.iteration > 0)
     views = f"{num_views} view{'s' * (num_views != 1)}"

@@ -79,14 +79,16 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     if factor is not None and factor < 1:
         raise ValueError(f"factor must be at least 1, got {factor}")
     check_perturbation(options.perturbation)
-    if dataset is None:
-        require_capture(root)
-    elif not root.exists():
+    if dataset is not None and not root.exists():
         raise ValueError(missing_capture(root))
+    layout = dataset or _recognized(root)
+    if layout is None:
+        require_capture(root)
     require_finished(root)
-    loader = LOADERS[dataset or recognize(root)]
-    capture = loader.load(root, options)
+    layout = layout or FALLBACK
+    capture = LOADERS[layout].load(root, options)
     _require_sides(root, capture)
+    capture.layout = describe_layout(root, layout, dataset)
     return capture
 
 
@@ -158,13 +160,24 @@ def require_finished(root: Path) -> None:
 
 def recognize(root: Path) -> str:
     """The layout of a capture, as a key of ``LOADERS``: ``layout`` in its dataset.json, or that of its files."""
+    return _recognized(root) or FALLBACK
+
+
+def _recognized(root: Path) -> str | None:
+    """As ``recognize``; None if no loader recognizes the files."""
     recognized = (name for name, loader in LOADERS.items() if loader.recognizes(root))
-    return _named_layout(root) or next(recognized, FALLBACK)
+    return _named_layout(root) or next(recognized, None)
 
 
-def describe_layout(root: Path, dataset: str | None = None) -> str:
-    """The layout that ``load_with`` reads a capture in, for the middle of messages; says if it is a guess."""
-    name, other = dataset or recognize(root), {"nerfds": "hypernerf", "hypernerf": "nerfds"}
+def describe_layout(root: Path, name: str, dataset: str | None) -> str:
+    """The layout that ``load_with`` reads a capture in, for the middle of messages; says if it is a guess.
+
+    Args:
+        root: Folder of the capture.
+        name: Key of ``LOADERS``.
+        dataset: Key that was asked for; None if ``name`` was recognized.
+    """
+    other = {"nerfds": "hypernerf", "hypernerf": "nerfds"}
     if dataset or _named_layout(root) or name not in other or not is_ambiguous(root):
         return name
     return f"{name}, a guess that --dataset {other[name]} overrides"
