@@ -39,6 +39,13 @@ def along_z(
     return Camera(viewmat, K, *size, time)
 
 
+def shifted(camera: Camera, x: float, time: float) -> Camera:
+    """A camera moved to its left by ``x``, at another time."""
+    viewmat = camera.viewmat.clone()
+    viewmat[0, 3] += x
+    return dataclasses.replace(camera, viewmat=viewmat, time=time)
+
+
 def make_splats(num: int = 60, seed: int = 3, channels: int | None = None, degree: int = 3) -> Splats:
     """Random splats with spherical harmonics or, if ``channels`` is given, with colours."""
     g = generator(seed)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from tests.data import captures, layouts
-from tests.data.captures import edit_json, look_away, stop_time, write_array
+from tests.data.captures import edit_json, exchange_cameras, look_away, stop_time, write_array
 from tests.prepare import boards
 from warpgs.captures import opening
 from warpgs.captures.check import check_capture, quick_findings
@@ -186,10 +186,7 @@ def test_a_folder_that_is_not_a_capture_is_not_fit(tmp_path):
 
 
 def test_cameras_that_do_not_match_the_images_are_a_warning(root):
-    paths = sorted((root / "camera").iterdir())
-    cameras = np.random.default_rng(0).permutation([path.read_text() for path in paths])
-    for path, text in zip(paths, cameras, strict=True):
-        path.write_text(text)
+    exchange_cameras(root)
     assert "cameras may not match" in texts(check_capture(root), "warning")
 
 

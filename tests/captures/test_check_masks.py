@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.data import layouts
-from tests.data.captures import edit_json, stop_time
+from tests.data.captures import edit_json, exchange_cameras, stop_time
 from warpgs.captures import check
 from warpgs.captures.check import check_capture, quick_findings
 from warpgs.captures.findings import few_of
@@ -92,10 +92,7 @@ def test_masks_of_nearly_everything_are_a_warning_only_if_that_moves(root):
 def test_wrong_cameras_do_not_make_masks_inverted(root):
     """Far from their epipolar lines are all pixels then, and which ones more so is chance."""
     convert_masks(root, lambda mask, k: np.where(np.arange(256) < 100, 0, 255).astype(np.uint8) + 0 * mask)
-    paths = sorted((root / "camera").iterdir())
-    cameras = np.random.default_rng(0).permutation([path.read_text() for path in paths])
-    for path, text in zip(paths, cameras, strict=True):
-        path.write_text(text)
+    exchange_cameras(root)
     report = check_capture(root)
     assert "cameras may not match" in str(report)
     assert "inverted" not in str(report)

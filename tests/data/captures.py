@@ -38,6 +38,14 @@ def look_away(root: Path) -> None:
         edit_json(path, orientation=(np.diag([-1.0, 1.0, -1.0]) @ rotation).tolist())
 
 
+def exchange_cameras(root: Path) -> None:
+    """Gives every frame the camera of a random one."""
+    paths = sorted((root / "camera").iterdir())
+    cameras = np.random.default_rng(0).permutation([path.read_text() for path in paths])
+    for path, text in zip(paths, cameras, strict=True):
+        path.write_text(text)
+
+
 def stop_time(root: Path) -> None:
     """Gives all frames one time."""
     names = json.loads((root / "metadata.json").read_text())

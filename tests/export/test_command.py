@@ -1,13 +1,13 @@
 """``warpgs export``: the files of a run, and one-line errors."""
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests.data.captures import edit_json
 from tests.export import scenes
 from tests.export.pages import read_page
 from tests.export.test_gltf import decoded as gltf_of
@@ -271,8 +271,8 @@ def stranded(run, tmp_path):
     (folder / "checkpoints").mkdir(parents=True)
     newest = checkpoint.list_checkpoints(run)[-1]
     (folder / "checkpoints" / newest.name).write_bytes(newest.read_bytes())
-    values = json.loads((run / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**values, "data": str(tmp_path / "gone")}))
+    shutil.copy(run / "config.json", folder)
+    edit_json(folder / "config.json", data=str(tmp_path / "gone"))
     return folder
 
 
@@ -306,8 +306,7 @@ def test_y_is_up_in_gltf(run, tmp_path):
 @pytest.mark.parametrize(("background", "color"), [("black", "#000000"), ([0.2, 0.4, 1.0], "#3366ff")])
 def test_the_summary_names_the_background_of_training_unless_the_file_has_it(run, tmp_path, background, color):
     folder = shutil.copytree(run, tmp_path / "run")
-    config = json.loads((folder / "config.json").read_text())
-    (folder / "config.json").write_text(json.dumps({**config, "background": background}))
+    edit_json(folder / "config.json", background=background)
     assert f"was {color} in training" in export(folder, tmp_path, time=0.5)
     assert "in training" not in export(folder, tmp_path, format="html", keys=1)
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tests.export import scenes
+from tests.scenes import shifted
 from warpgs.config import RenderSettings
 from warpgs.rendering import render
 from warpgs.runs.trained import MAX_GRAPHS, TrainedScene
@@ -43,12 +44,6 @@ def test_what_plays_a_scene_imports_no_loader_and_no_ray_tracer(module):
     assert [name for name in imported if name.startswith("warpgs.synthetic.") or "raytrace" in name] == []
 
 
-def translated(camera, by, time):
-    viewmat = camera.viewmat.clone()
-    viewmat[0, 3] += by
-    return dataclasses.replace(camera, viewmat=viewmat, time=time)
-
-
 def test_a_trained_scene_prints_as_what_it_is(trained):
     static, dynamic = len(trained.scene.static), len(trained.scene.dynamic)
     gaussians = f"{static:,} static and {dynamic:,} dynamic Gaussians"
@@ -57,7 +52,7 @@ def test_a_trained_scene_prints_as_what_it_is(trained):
 
 def test_one_graph_plays_every_camera_of_a_size(trained, captured):
     for k in range(3):
-        camera = translated(scenes.camera(), 0.1 * k, 0.1 * k)
+        camera = shifted(scenes.camera(), 0.1 * k, 0.1 * k)
         assert torch.equal(trained.play(camera), trained.render(camera).joint.image)
     assert captured == [(64, 48)]
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from tests import plain, tiny
+from tests.data.captures import edit_json
 from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig, validate
 from warpgs.evaluation import evaluate_run
@@ -59,21 +60,17 @@ def opaque(run, tmp_path):
     data = shutil.copytree(Run.open(run, "cpu").config.data, tmp_path / "balls")
     for path in data.rglob("*.png"):
         write_png(path, np.ascontiguousarray(cv2.imread(str(path))[..., ::-1]))
-    return edited(shutil.copytree(run, tmp_path / "run"), lambda values: values.update(data=str(data)))
-
-
-def edited(run, change):
-    """The run after a change of its config."""
-    values = json.loads((run / "config.json").read_text())
-    change(values)
-    (run / "config.json").write_text(json.dumps(values))
-    return run
+    copy = shutil.copytree(run, tmp_path / "run")
+    edit_json(copy / "config.json", data=str(data))
+    return copy
 
 
 @pytest.fixture
 def older(run, tmp_path):
     """A copy of the run as if it had been made before runs had a background."""
-    return edited(shutil.copytree(run, tmp_path / "older"), lambda values: values.pop("background"))
+    copy = shutil.copytree(run, tmp_path / "older")
+    edit_json(copy / "config.json", background=None)
+    return copy
 
 
 def background_of(config, capture):
@@ -237,7 +234,8 @@ def test_the_mean_of_many_frames_is_that_of_some_of_them(capture, monkeypatch):
 
 @pytest.mark.parametrize("color", [[0.1, 0.2], [0.1, 0.2, 1.5], [0.1, 0.2, "0.3"], [0.1, 0.2, float("nan")], "grey"])
 def test_a_background_that_is_no_colour_is_refused(mean_run, tmp_path, color):
-    damaged = edited(shutil.copytree(mean_run, tmp_path / "run"), lambda values: values.update(background=color))
+    damaged = shutil.copytree(mean_run, tmp_path / "run")
+    edit_json(damaged / "config.json", background=color)
     with pytest.raises(ValueError, match=r"config\.json: background"):
         open_run(damaged, "cpu")
 

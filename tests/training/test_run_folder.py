@@ -19,12 +19,6 @@ from warpgs.training.train import train
 pytestmark = pytest.mark.usefixtures("contracts_off")
 
 
-@pytest.fixture
-def config(tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
-    return dataclasses.replace(tiny.CONFIG, data=tiny.write(tmp_path / "capture"), out=tmp_path / "run")
-
-
 def test_a_training_that_is_refused_leaves_the_run_of_another_as_it_is(config, monkeypatch):
     """The other one tries its masks out, so that it has written nothing yet, and evaluates in the end."""
     refusals = []

@@ -267,12 +267,6 @@ def test_ctrl_c_saves_a_checkpoint_and_tells_how_to_continue(data, tmp_path):
     assert checkpoint.load(checkpoint.list_checkpoints(folder)[-1]).metadata.iteration > 0
 
 
-@pytest.fixture
-def config(tmp_path, contracts_off, monkeypatch):
-    monkeypatch.setattr(evaluate_run, "VIDEO_FRAMES", 2)
-    return dataclasses.replace(tiny.CONFIG, data=tiny.write(tmp_path / "capture"), out=tmp_path / "run")
-
-
 def test_a_moved_capture_is_given_to_eval_and_to_resume(config, tmp_path, refused, train):
     warpgs.train(config)
     moved = config.data.rename(tmp_path / "elsewhere")

@@ -11,16 +11,14 @@ from torch import nn
 from tests import plain, tiny
 from tests.reference.projection import project as reference
 from tests.scenes import along_z, error, generator, relative_error
+from tests.training.density import sets
 from warpgs.config import RenderSettings
 from warpgs.model.gaussians import PARAMETERS, Gaussians
-from warpgs.model.scene import SplitScene
 from warpgs.ops.projection import Geometry, View
 from warpgs.rendering import opacities_on_screen, render
 from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.opacity_reset import reset_opacities
-from warpgs.training.optimizer import make_optimizer
 
-NETWORK = plain.model(position_bands=1, time_bands=1, depth=1, width=2)
 PHASE = plain.phase(use_appearance=False, sh_degree=0)
 ANTIALIAS = RenderSettings(antialias=True)
 FOCAL, DEPTH, SIZE = 100.0, 2.0, (96, 80)
@@ -60,14 +58,9 @@ def make_gaussians(seed, stds):
 
 def make_scene(stds=(STDS, STDS)):
     """A scene, and its optimizer after one step at rate 0 that left every moment at 1 or more."""
-    static, dynamic = (make_gaussians(*pair) for pair in enumerate(stds))
-    scene = SplitScene(static, dynamic, NETWORK, torch.zeros(3), torch.ones(3))
+    scene, optimizer = sets.make_scene(*(make_gaussians(*pair) for pair in enumerate(stds)))
     scene.deformation = Receding()
-    optimizer = make_optimizer(dict(scene.named_parameters()), tiny.equal_rates(0.0))
-    for parameter in scene.parameters():
-        parameter.grad = torch.full_like(parameter, 100.0)
-    optimizer.step()
-    optimizer.zero_grad()
+    scene.zero_grad()
     return scene, optimizer
 
 

@@ -9,7 +9,7 @@ import torch
 from tests import plain, tiny
 from tests.reference.render import as_dict
 from tests.reference.render import render as reference
-from tests.scenes import as_gaussians, error, make_camera, make_splats
+from tests.scenes import as_gaussians, error, make_camera, make_splats, shifted
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.runs.logger import TrainingLogger
@@ -25,12 +25,6 @@ OPAQUE_LOGIT = 20.0
 def turned_around(camera):
     """The same camera with the opposite viewing direction."""
     return dataclasses.replace(camera, viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ camera.viewmat)
-
-
-def shifted(camera, x, time):
-    viewmat = camera.viewmat.clone()
-    viewmat[0, 3] += x
-    return dataclasses.replace(camera, viewmat=viewmat, time=time)
 
 
 CAMERAS = [AHEAD, shifted(AHEAD, 2.5, 0.4), shifted(AHEAD, -3.0, 0.7), turned_around(AHEAD)]
