@@ -40,7 +40,7 @@ def test_the_list_of_commands_fits_on_a_screen(option, capsys):
 def test_help_of_train_is_short_and_help_all_complete(capsys):
     short, complete = shown(capsys, "train", "--help"), shown(capsys, "train", "--help-all")
     options = re.compile(r"^[│ ] --([a-z.-]+)", re.MULTILINE)
-    assert len(options.findall(short)) == len(TRAIN_OPTIONS) == 15
+    assert len(options.findall(short)) == len(TRAIN_OPTIONS) == 14
     assert len(options.findall(complete)) > 60
     assert "--densify.max-gaussians INT" in complete
     assert "warpgs train --help-all" in short

@@ -31,7 +31,6 @@ def test_presets_are_valid(name):
     ("name", "value"),
     [
         ("checkpoint_every", 0),
-        ("keep_checkpoints", 0),
         ("densify.every", 0),
         ("densify.gradient", -1e-4),
         ("densify.weakest", 1.0),  # would leave no Gaussian

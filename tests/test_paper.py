@@ -107,7 +107,7 @@ PAPER = {
 
 RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
 RUN |= {"lpips_net", "as_taken"}
-RUN |= {"damage_masks", "checkpoint_every", "keep_checkpoints", "resident_bytes"}
+RUN |= {"damage_masks", "checkpoint_every", "resident_bytes"}
 """Options of a run that do not belong to the method."""
 
 METHOD = Path(__file__).parents[1] / "docs" / "method.md"
@@ -210,7 +210,7 @@ def test_training_with_the_preset_runs_through_all_stages(tmp_path):
     schedule = dataclasses.replace(tiny.SCHEDULE, appearance_from=paper.schedule.appearance_from, warmup=0)
     densify = dataclasses.replace(paper.densify, every=4, gradient=1e-5, max_gaussians=120, split_size=0.1)
     small = {"device": "cpu", "model": model, "schedule": schedule, "densify": densify}
-    config = dataclasses.replace(paper, **small, checkpoint_every=22, keep_checkpoints=100)  # 22: before stage II
+    config = dataclasses.replace(paper, **small, checkpoint_every=22)  # 22: before stage II
     trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run", config)
     with tiny.in_haste():
         assert tiny.train(trainer)

@@ -26,6 +26,8 @@ from warpgs.training.optimizer import GROUPS
 from warpgs.training.schedule import Action, IterationPlan
 from warpgs.training.trainer import Trainer
 
+checkpoint.NUM_KEPT = 100  # tests look at earlier ones, too
+
 SCENE = BuiltinScene(width=32, height=24, num_frames=6, num_samples=1, num_points=200)
 
 MODEL = plain.model(
@@ -57,7 +59,6 @@ CONFIG = plain.config(
     densify=plain.densify(every=4, gradient=1e-5, max_gaussians=120, weakest=0.01),
     schedule=SCHEDULE,
     checkpoint_every=7,
-    keep_checkpoints=100,
 )
 
 

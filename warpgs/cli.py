@@ -75,7 +75,7 @@ HELP = ("--help", "-h", "--help-all")
 
 TRAIN_OPTIONS = (
     *("data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "assume", "exposure"),
-    *("antialias", "checkpoint_every", "keep_checkpoints", "lpips"),
+    *("antialias", "checkpoint_every", "lpips"),
 )
 """Options of ``train`` that --help shows; --help-all shows all."""
 

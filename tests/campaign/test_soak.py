@@ -10,6 +10,7 @@ import pytest
 from tests import tiny
 from tests.campaign.memory import MAX_GROWTH, growth, in_mebibytes, needs_proc, resident
 from warpgs.config import scaled
+from warpgs.runs import checkpoint
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -18,10 +19,11 @@ MIN_ITERATIONS = 1000
 
 
 @needs_proc
-def test_the_memory_of_long_trainings_is_flat(tmp_path, count, minutes):
+def test_the_memory_of_long_trainings_is_flat(tmp_path, count, minutes, monkeypatch):
     if count < MIN_ITERATIONS:
         pytest.skip(f"takes minutes: --campaign {MIN_ITERATIONS} trains as many iterations, --minutes 30 repeatedly")
-    config = scaled(dataclasses.replace(tiny.CONFIG, iterations=count, checkpoint_every=97, keep_checkpoints=2))
+    monkeypatch.setattr(checkpoint, "NUM_KEPT", 2)
+    config = scaled(dataclasses.replace(tiny.CONFIG, iterations=count, checkpoint_every=97))
     data, start, runs = tiny.write(tmp_path / "cache"), time.monotonic(), 0
     sizes: list[int] = []
     while not sizes or time.monotonic() < start + 60 * minutes:

@@ -367,8 +367,7 @@ def test_a_missing_field_that_every_version_writes_is_refused_by_its_name(run, n
 
 
 FIRST = {
-    "": "antialias assume checkpoint_every graph keep_checkpoints resident_bytes seed "
-    "model loss optim densify schedule",
+    "": "antialias assume checkpoint_every graph resident_bytes seed model loss optim densify schedule",
     "densify": "every gradient max_gaussians split_size visibility",
     "loss": "depth depth_dynamic depth_end ssim",
     "model": "depth dynamic_points half max_static_points position_bands sh_degree skip time_bands width",

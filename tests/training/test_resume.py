@@ -30,7 +30,6 @@ LONG = {
     "device": "cpu",
     "iterations": 120,
     "checkpoint-every": 15,
-    "keep-checkpoints": 100,
     "model.width": 8,
     "model.depth": 2,
     "model.skip": 1,
@@ -119,6 +118,12 @@ def test_a_run_of_version_0_3_keeps_the_extent_as_its_unit(data, tmp_path, poses
     assert again.views.poses is None or again.views.poses.unit == again.unit
     again.save()
     assert checkpoint.load(checkpoint.path_of(tmp_path, 0)).metadata.unit == again.unit
+
+
+def test_training_keeps_the_two_newest_checkpoints(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "NUM_KEPT", 2)
+    tiny.train(tiny.trainer(data, tmp_path))
+    assert checkpoint.list_checkpoints(tmp_path) == [checkpoint.path_of(tmp_path, at) for at in (28, tiny.LENGTH)]
 
 
 def test_another_seed_gives_another_run(data, whole, tmp_path):
@@ -260,7 +265,7 @@ def test_a_killed_and_resumed_run_is_bit_identical(data, tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     with subprocess.Popen([sys.executable, SCRIPT, *options, str(killed)], stdout=subprocess.DEVNULL) as run:
         try:
-            while len(checkpoint.list_checkpoints(killed)) < 3:
+            while not checkpoint.path_of(killed, 30).exists():
                 assert run.poll() is None
                 time.sleep(0.005)
         finally:

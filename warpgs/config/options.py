@@ -87,9 +87,7 @@ class TrainConfig:
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     schedule: Schedule = field(default_factory=Schedule)
     checkpoint_every: Annotated[int, Bounds(min=1)] = 2_500
-    """Iterations between checkpoints."""
-    keep_checkpoints: Annotated[int, Bounds(min=1)] = 2
-    """Number of newest checkpoints to keep."""
+    """Iterations between checkpoints; the two newest are kept."""
     resident_bytes: int = 4 << 30
     """Maximum memory for training views on the device [bytes]; larger captures are decoded once into a file in
     the user's cache and read from there."""

@@ -25,6 +25,9 @@ from warpgs.model.scene import SplitScene
 VERSION = 2
 FOLDER = "checkpoints"
 
+NUM_KEPT = 2
+"""Number of newest checkpoints of a run that training keeps: where one is damaged, the other continues."""
+
 MAX_BYTES = 16 << 30
 """Maximum size of a checkpoint [bytes]; 20 million Gaussians with Adam's moments."""
 

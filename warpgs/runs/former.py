@@ -40,6 +40,7 @@ DAMAGE = {"erode": "PIXELS", "dilate": "PIXELS", "holes": "FRACTION"}
 REMOVED: dict[str, Removed] = {
     "static_appearance": Removed("--frozen says what stage II keeps"),
     "static_geometry": Removed("--frozen says what stage II keeps"),
+    "keep_checkpoints": Removed("the two newest are kept"),
     "masks": Removed(),
     **{f"masks.{kind}": Removed(f"it is --damage-masks {kind}:{size} now") for kind, size in DAMAGE.items()},
     "try_masks": Removed("--assume auto tries masks out, --assume masks does not"),

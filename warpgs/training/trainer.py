@@ -256,7 +256,7 @@ class Trainer:
         tensors |= {f"gradients.{name}": tensor for name, tensor in self.step.density.state().items()}
         tensors["alignments"] = self.alignments
         checkpoint.save(checkpoint.path_of(self.run, self.iteration), tensors, self._metadata())
-        checkpoint.keep_newest(self.run, self.config.keep_checkpoints)
+        checkpoint.keep_newest(self.run, checkpoint.NUM_KEPT)
 
     def _metadata(self) -> checkpoint.Metadata:
         """The plain values of a checkpoint of the current iteration."""
