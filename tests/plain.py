@@ -25,7 +25,7 @@ model = partial(
 )
 loss = partial(replace, replace(PAPER.loss, depth=2.0, depth_dynamic=1.0, depth_end=0.2, depth_gate=True))
 optim = partial(replace, replace(PAPER.optim, means=1.6e-4, means_anneal="run"))
-densify = partial(replace, replace(PAPER.densify, unit="pixel", split_size=2.0))
+densify = partial(replace, replace(PAPER.densify, unit="pixel"))
 schedule = partial(
     replace, replace(PAPER.schedule, densify_from=500, densify_until=15_000, appearance_from=0, warmup=1_000)
 )

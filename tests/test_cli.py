@@ -128,8 +128,8 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["train", "--iteratons=3"], "warpgs train: there is no option --iteratons; did you mean --iterations?"),
         (["train", "--model.dept", "3"], "warpgs train: there is no option --model.dept; did you mean --model.depth?"),
         (
-            ["train", "--densify.dense_fraction=1"],
-            "warpgs train: there is no option --densify.dense-fraction; it is --densify.split-size now\n",
+            ["train", "--schedule.relight_from=1"],
+            "warpgs train: there is no option --schedule.relight-from; it is --schedule.appearance-from now\n",
         ),
         (
             ["train", "--densify.no-depth-gradients"],

@@ -10,7 +10,7 @@ import torch
 
 from tests import plain
 from tests.scenes import make_camera
-from warpgs.config import DensifyConfig, LossConfig, ModelConfig, TrainConfig, scaled, validate
+from warpgs.config import LossConfig, ModelConfig, TrainConfig, scaled, validate
 from warpgs.config.presets import PRESETS
 from warpgs.data.capture import Capture
 from warpgs.initialization.plan import determined_bands, make_plan
@@ -34,7 +34,6 @@ def test_presets_are_valid(name):
         ("densify.every", 0),
         ("densify.gradient", -1e-4),
         ("densify.weakest", 1.0),  # would leave no Gaussian
-        ("densify.split_size", 0.0),  # likewise
         ("model.depth", 0),
         ("model.width", -4),
         ("model.max_static_points", -1),
@@ -77,13 +76,6 @@ def test_networks_without_any_input_of_position_or_time_are_refused(bands):
     validate(TrainConfig(model=model))
     with pytest.raises(ValueError, match=r"without model\.raw_input the networks need"):
         validate(TrainConfig(model=dataclasses.replace(model, raw_input=False)))
-
-
-def test_sizes_in_pixels_are_refused_as_fractions_of_the_extent():
-    pixels = DensifyConfig(unit="extent")
-    with pytest.raises(ValueError, match=r"is a fraction of the extent, 0.01 in 3DGS, got 2.0"):
-        validate(TrainConfig(densify=pixels))
-    validate(TrainConfig(densify=dataclasses.replace(pixels, split_size=0.01)))
 
 
 def test_a_schedule_with_only_pretraining_is_refused():

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests import tiny
-from warpgs.config import fields
+from warpgs.config import DensifyConfig, fields
 from warpgs.config.presets import PRESETS
 from warpgs.runs import checkpoint
 from warpgs.training import optimizer
@@ -69,7 +69,6 @@ PAPER = {
         "densify.every": 100,
         "densify.gradient": 2e-4,
         "densify.unit": "extent",
-        "densify.split_size": 0.01,
         "densify.min_pixels": 0,
         "schedule.densify_from": 600,
         "schedule.densify_until": 14_900,
@@ -142,6 +141,11 @@ def test_the_rates_that_are_no_options_are_those_of_deformable_3dgs():
     assert operations.MIN_OPACITY == 0.005
 
 
+def test_gaussians_are_split_and_removed_above_the_sizes_of_3dgs():
+    densify = PRESETS["paper"].densify
+    assert (densify.unit, densify.split_size, densify.max_size) == ("extent", 0.01, 0.1)
+
+
 def table():
     """Switch → (value in ``paper``, value in ``best``), from the rows of the tables of docs/method.md."""
     rows = {}
@@ -202,13 +206,14 @@ def test_a_file_beside_each_switch_reads_it():
     assert checked > 50
 
 
-def test_training_with_the_preset_runs_through_all_stages(tmp_path):
+def test_training_with_the_preset_runs_through_all_stages(tmp_path, monkeypatch):
     """Small networks and few iterations; every switch of the method as in the preset."""
+    monkeypatch.setattr(DensifyConfig, "max_size", 1.0)  # of few points, each is large
     paper = PRESETS["paper"]
     sizes = ("position_bands", "time_bands", "width", "max_static_points", "dynamic_points")
     model = dataclasses.replace(paper.model, **{name: getattr(tiny.MODEL, name) for name in sizes})
     schedule = dataclasses.replace(tiny.SCHEDULE, appearance_from=paper.schedule.appearance_from, warmup=0)
-    densify = dataclasses.replace(paper.densify, every=4, gradient=1e-5, max_gaussians=120, split_size=0.1)
+    densify = dataclasses.replace(paper.densify, every=4, gradient=1e-5, max_gaussians=120)
     small = {"device": "cpu", "model": model, "schedule": schedule, "densify": densify}
     config = dataclasses.replace(paper, **small, checkpoint_every=22)  # 22: before stage II
     trainer = tiny.trainer(tiny.write(tmp_path), tmp_path / "run", config)

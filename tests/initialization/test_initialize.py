@@ -595,7 +595,7 @@ def test_gaussians_of_unknown_depth_are_small_unless_sizes_are_unbounded(config,
 @pytest.mark.parametrize("unit", ["pixel", "extent"])
 def test_offsets_are_in_half_view_sizes_or_as_in_the_paper_in_scene_units(deformation, unit):
     model = dataclasses.replace(CONFIG.model, deformation=deformation)
-    config = dataclasses.replace(CONFIG, model=model, densify=plain.densify(unit=unit, split_size=0.01))
+    config = dataclasses.replace(CONFIG, model=model, densify=plain.densify(unit=unit))
     capture = make_capture(points_at([12, 2], [20, 20]))
     field = initial_scene(config, capture).deformation
     units = (field.network if deformation == "splines" else field).units

@@ -220,7 +220,7 @@ def test_the_rate_of_positions_had_a_factor_of_its_own(run, factor, means, unit)
     def change(values):
         del values["means_in_views"]
         values["optim"] |= {"means": 2e-4, "means_scale": factor}
-        values["densify"] |= {"unit": "extent", "split_size": 0.01}
+        values["densify"] |= {"unit": "extent"}
 
     edit(run, change)
     plan = read_config(run)
@@ -368,7 +368,7 @@ def test_a_missing_field_that_every_version_writes_is_refused_by_its_name(run, n
 
 FIRST = {
     "": "antialias assume checkpoint_every graph resident_bytes seed model loss optim densify schedule",
-    "densify": "every gradient max_gaussians split_size visibility",
+    "densify": "every gradient max_gaussians visibility",
     "loss": "depth depth_dynamic depth_end ssim",
     "model": "depth dynamic_points half max_static_points position_bands sh_degree skip time_bands width",
     "optim": "means networks networks_end sh_dc",
@@ -389,15 +389,14 @@ def test_a_run_of_the_first_version_opens_with_the_values_that_it_had(tmp_path, 
             for name in set(part) - set(names.split()):
                 del part[name]
         values["schedule"]["relight_from"] = values["schedule"].pop("appearance_from")
-        del values["densify"]["split_size"]
-        values["densify"] |= {"dense_fraction": 0.01}
+        values["densify"] |= {"dense_fraction": 0.01, "max_size": 0.1}
         values |= {"dap": True, "vdp": True, "app": False, "stage2": True}
         values |= {"static_geometry": False, "static_appearance": False}
         values["masks"] = {"erode": 0, "dilate": 0, "holes": 0.0}
         values["model"] |= {"appearance_degree": 0, "appearance_opacity": False}
 
     edit(run, reduce)
-    densify = dataclasses.replace(written.densify, unit="extent", split_size=0.01)
+    densify = dataclasses.replace(written.densify, unit="extent")
     expected = plain.plan(dataclasses.replace(written, data=None, densify=densify))
     assert read_config(run) == dataclasses.replace(expected, means_in_views=True)
 
@@ -476,15 +475,23 @@ def test_a_config_with_the_old_name_of_a_field_still_opens(run):
     assert read_config(run).schedule.appearance_from == tiny.CONFIG.schedule.appearance_from + 7
 
 
-def test_sizes_of_a_run_of_version_0_3_stay_fractions_of_the_extent(run):
-    def reduce(values):
-        values["densify"] |= {"dense_fraction": 0.02, "max_size": 0.2}
-        for name in ("unit", "split_size"):
-            del values["densify"][name]
+def reduce_to_version_0_3(values, dense_fraction, max_size):
+    values["densify"] |= {"dense_fraction": dense_fraction, "max_size": max_size}
+    del values["densify"]["unit"]
 
-    edit(run, reduce)
+
+def test_sizes_of_a_run_of_version_0_3_stay_fractions_of_the_extent(run):
+    edit(run, lambda values: reduce_to_version_0_3(values, 0.01, 0.1))
     densify = read_config(run).densify
-    assert (densify.unit, densify.split_size, densify.max_size) == ("extent", 0.02, 0.2)
+    assert (densify.unit, densify.split_size, densify.max_size) == ("extent", 0.01, 0.1)
+    require_resumable(run)
+
+
+@pytest.mark.parametrize(("dense_fraction", "max_size"), [(0.02, 0.1), (0.01, 0.2)])
+def test_a_run_of_version_0_3_with_other_sizes_is_not_resumed(run, dense_fraction, max_size):
+    edit(run, lambda values: reduce_to_version_0_3(values, dense_fraction, max_size))
+    with pytest.raises(ValueError, match=r"cannot be resumed: densify\.\w+ is 0\.\d+; .*sizes are those of 3DGS"):
+        require_resumable(run)
 
 
 def test_a_misspelt_capture_of_a_run_is_told_the_similar_one(run, tmp_path):

@@ -249,9 +249,7 @@ def terms_with_trust(weight, margin, loss=LOSS, **options):
 
 
 def test_lengths_in_the_loss_are_in_view_sizes_or_as_in_the_paper_in_scene_units():
-    in_views, in_scene = (
-        terms_with_trust(1.0, 0.0, densify=plain.densify(unit=unit, split_size=0.01)) for unit in ("pixel", "extent")
-    )
+    in_views, in_scene = (terms_with_trust(1.0, 0.0, densify=plain.densify(unit=unit)) for unit in ("pixel", "extent"))
     lengths = {"depth", "depth_dynamic"}
     ratios = {name: in_scene[name] / in_views[name] for name in in_views}
     assert ratios == pytest.approx({name: VIEW_SIZE if name in lengths else 1.0 for name in ratios}, rel=1e-5)
@@ -259,7 +257,7 @@ def test_lengths_in_the_loss_are_in_view_sizes_or_as_in_the_paper_in_scene_units
 
 @pytest.mark.parametrize(("unit", "length"), [("pixel", VIEW_SIZE), ("extent", 1.0)])
 def test_rates_of_positions_are_in_view_sizes_or_as_in_the_paper_in_scene_units(unit, length):
-    densify = plain.densify(unit=unit, split_size=0.01)
+    densify = plain.densify(unit=unit)
     _, plan, step = prepared("pretrain", densify=densify, optim=plain.optim(means=0.01))
     step(plan, Sample(0, 0.0, 0))
     assert step._inputs.learning_rates["static.means"].item() == pytest.approx(0.01 * length)

@@ -19,17 +19,15 @@ class DensifyConfig:
     gradient: float = 3e-4
     """Mean screen-space gradient norm above which a Gaussian is cloned or split."""
     unit: Literal["pixel", "extent"] = "pixel"
-    """Unit of ``split_size``, which is a standard deviation: a pixel of the nearest training view that has shown the
-    Gaussian since the last densification, at its depth there; or the radius of the cameras' positions, as in 3DGS
-    (paper). Gaussians that no view has shown have any size in pixels. With pixel, rates of positions and
-    errors of depth are in view sizes of the capture (docs/glossary.md), and offsets of the deformation in halves of it;
-    else all are in scene units."""
-    split_size: Annotated[float, Bounds(positive=True)] = 2.0
-    """Size above which a Gaussian is split instead of cloned. Above ten times this size, as in 3DGS, Gaussians are
-    removed once opacities have been reset, and ``max_elongation`` holds."""
+    """Unit of sizes, which are standard deviations: a pixel of the nearest training view that has shown the Gaussian
+    since the last densification, at its depth there; or the radius of the cameras' positions, as in 3DGS (paper).
+    Gaussians above 2 pixels, or 0.01 of the extent, are split instead of cloned; above ten times that they are removed
+    once opacities have been reset, and ``max_elongation`` holds. Those that no view has shown have any size in pixels.
+    With pixel, rates of positions and errors of depth are in view sizes of the capture (docs/glossary.md), and offsets
+    of the deformation in halves of it; else all are in scene units."""
     max_elongation: float = 10.0
     """After every ``every`` iterations and at the end, the longest axis of static Gaussians is cut to this many times
-    their second longest, or to ten times ``split_size`` if that is longer. 0: never."""
+    their second longest, or to 20 pixels (0.1 of the extent) if that is longer. 0: never."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
     min_pixels: int = 24
@@ -42,6 +40,11 @@ class DensifyConfig:
     weakest: Annotated[float, Bounds(max=0.99)] = 0.01
     """Each pruning after the end of densification also removes the Gaussians that contribute least to the training
     views: those that together hold this fraction of all blend weights. 0: none."""
+
+    @property
+    def split_size(self) -> float:
+        """Size above which a Gaussian is split instead of cloned, in ``unit``."""
+        return {"pixel": 2.0, "extent": 0.01}[self.unit]
 
     @property
     def max_size(self) -> float:

@@ -142,12 +142,6 @@ def validate(config: TrainConfig) -> None:
             "without model.raw_input the networks need model.position_bands and model.time_bands of at least 1, "
             f"got {model.position_bands} and {model.time_bands}"
         )
-    densify = config.densify
-    if densify.unit == "extent" and densify.split_size >= 1.0:
-        raise ValueError(
-            "with densify.unit extent, densify.split_size is a fraction of the extent, 0.01 in 3DGS, "
-            f"got {densify.split_size}"
-        )
     MaskPerturbation.parse(config.damage_masks)
     names, rgb = get_args(BackgroundName), config.background
     is_rgb = isinstance(rgb, tuple) and len(rgb) == 3 and all(0.0 <= value <= 1.0 for value in rgb)

@@ -51,7 +51,6 @@ PAPER = replace(
         BEST.densify,
         gradient=2e-4,
         unit="extent",
-        split_size=0.01,
         max_elongation=0.0,
         min_pixels=0,
         reseed=0.0,

@@ -1,7 +1,6 @@
 """Options of earlier versions: their values as today's version writes them, and advice on those that are gone."""
 
 from collections.abc import Callable
-from math import isclose, nan
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +8,7 @@ from warpgs.runtime.devices import choose_device
 
 REMOVED_PRESETS = ("fast",)
 
-RENAMED = {"relight_from": "appearance_from", "dense_fraction": "split_size"}
+RENAMED = {"relight_from": "appearance_from"}
 """Fields that earlier versions wrote under another name."""
 
 
@@ -37,6 +36,14 @@ FROZEN = {(True, True): "nothing", (False, True): "geometry", (True, False): "ap
 
 DAMAGE = {"erode": "PIXELS", "dilate": "PIXELS", "holes": "FRACTION"}
 
+SIZES = "sizes are those of 3DGS, in the unit of densify.unit"
+
+
+def in_pixels(densify: dict[str, Any]) -> bool:
+    """Whether sizes of Gaussians are in pixels."""
+    return bool(densify.get("unit") == "pixel")
+
+
 REMOVED: dict[str, Removed] = {
     "static_appearance": Removed("--frozen says what stage II keeps"),
     "static_geometry": Removed("--frozen says what stage II keeps"),
@@ -47,11 +54,10 @@ REMOVED: dict[str, Removed] = {
     "vrig_factor": Removed("--factor is for these captures, too"),
     **{name: Removed(f"--omit {name} omits it") for name in COMPONENTS},
     "densify.depth_gradients": Removed(),
-    "densify.max_size": Removed(
-        "Gaussians are removed above ten times densify.split_size",
-        lambda value, densify: isclose(value, 10.0 * densify.get("split_size", densify.get("dense_fraction", nan))),
-    ),
+    "densify.dense_fraction": Removed(SIZES, lambda value, densify: value == 0.01),
+    "densify.max_size": Removed(SIZES, lambda value, densify: value == (20.0 if in_pixels(densify) else 0.1)),
     "densify.min_opacity": _always(0.005),
+    "densify.split_size": Removed(SIZES, lambda value, densify: value == (2.0 if in_pixels(densify) else 0.01)),
     "densify.noise": Removed("there is no strategy mcmc any more"),
     "loss.opacity": Removed("there is no such term any more", lambda value, section: value == 0.0),
     "loss.scale": Removed("there is no such term any more", lambda value, section: value == 0.0),

@@ -15,8 +15,8 @@ from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.gradient import GradientStrategy, Limits, densify
 
-UNIT = 2.0
-CONFIG = plain.densify(gradient=0.5, split_size=0.05)
+UNIT = 10.0
+CONFIG = plain.densify(gradient=0.5, unit="extent")
 SMALL, LARGE = 0.09, 0.11  # around UNIT · split_size = 0.1
 HUGE, OVERSIZED = 0.9, 1.1  # around UNIT · max_size = 1
 SMALL_GRADIENT, LARGE_GRADIENT = 0.4, 0.6  # around the threshold

@@ -11,6 +11,7 @@ from tests import tiny
 from tests.reference.covariance import rotation
 from tests.scenes import error, generator, relative_error
 from tests.training.density.sets import NETWORK, copies, equal, make_gaussians, make_scene, trained
+from warpgs.config import DensifyConfig
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.runs.logger import TrainingLogger
@@ -115,7 +116,7 @@ def test_the_size_of_any_shape_is_that_of_each_gaussian():
 
 @pytest.mark.parametrize("unit", ["extent", "pixel"])
 def test_static_needles_alone_are_shortened_in_the_unit_of_densification(data, tmp_path, unit):
-    densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, split_size=0.05, unit=unit)
+    densify_config = dataclasses.replace(tiny.CONFIG.densify, max_elongation=10.0, unit=unit)
     trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config))
     needles, extent = make_gaussians([SIZE]), trainer.capture.extent
     needles.log_scales.data = torch.tensor([[0.001, 9.0, 0.001]]).log()
@@ -123,14 +124,15 @@ def test_static_needles_alone_are_shortened_in_the_unit_of_densification(data, t
     trainer.step.density.resolution[:] = 4.0
     trainer._adapt(tiny.plan_to(trainer, "shorten"), Mock(spec=TrainingLogger))
     assert abs(extent - 1.0) > 0.1
-    expected = {"extent": 0.5 * extent, "pixel": 0.5 / 4.0}[unit]
+    expected = {"extent": 0.1 * extent, "pixel": 20.0 / 4.0}[unit]
     assert trainer.scene.static.scales.max().item() == pytest.approx(expected, rel=1e-5)
     assert trainer.scene.dynamic.scales.max().item() == pytest.approx(9.0, rel=1e-5)
 
 
 @pytest.mark.parametrize("frozen", ["nothing", "all"])
-def test_training_with_a_limit_ends_without_static_needles(data, tmp_path, frozen):
-    limit = dataclasses.replace(tiny.CONFIG.densify, max_elongation=1.05, split_size=1e-7)
+def test_training_with_a_limit_ends_without_static_needles(data, tmp_path, monkeypatch, frozen):
+    monkeypatch.setattr(DensifyConfig, "max_size", 1e-6)
+    limit = dataclasses.replace(tiny.CONFIG.densify, max_elongation=1.05)
     schedule = dataclasses.replace(tiny.SCHEDULE, reset_every=100)  # until then nothing is removed as too large
     config = dataclasses.replace(tiny.CONFIG, frozen=frozen, schedule=schedule)
     elongations = []
