@@ -4,6 +4,7 @@ It is ray-traced and written in the layout of NeRF-DS, so that it is loaded like
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -110,6 +111,27 @@ def trace(
     return camera, image.cpu(), depth.cpu(), hits.cpu()
 
 
+def stereo_frames(num_steps: int, baseline: float) -> list[tuple[str, int, float]]:
+    """Name, time step, and shift to the right of every frame of a camera that trains, and one beside it that evaluates.
+
+    The second one is at a distance of ``baseline`` [world units], and records every second step.
+
+    Raises:
+        ValueError: If there are fewer than two time steps.
+    """
+    if num_steps < 2:
+        raise ValueError(f"a built-in capture needs at least 2 frames, got {num_steps}")
+    right = [(f"right_{k:06d}", k, baseline) for k in range(0, num_steps, 2)]
+    return [*((f"left_{k:06d}", k, 0.0) for k in range(num_steps)), *right]
+
+
+def write_stereo_index(folder: Path, frames: Sequence[tuple[str, int, float]]) -> None:
+    """Writes the time and camera of every frame, and which of them evaluate; raises as ``writer.write_index``."""
+    cameras = {name: int(shift > 0) for name, _, shift in frames}
+    steps = {name: step for name, step, _ in frames}
+    writer.write_index(folder, steps, [name for name, camera in cameras.items() if camera], cameras)
+
+
 def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.device, quiet: bool = False) -> None:
     """Writes the capture to an empty folder.
 
@@ -117,26 +139,20 @@ def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.devic
         ValueError: If there are fewer than two frames.
         OSError: If a file cannot be written; the message names it.
     """
-    if scene.num_frames < 2:
-        raise ValueError(f"the built-in scene needs at least 2 frames, got {scene.num_frames}")
-    num_static = len(_static_bodies())
-    jobs = [("left", k, 0.0) for k in range(scene.num_frames)]
-    jobs += [("right", k, BASELINE) for k in range(0, scene.num_frames, 2)]
-    times, points = {f"{side}_{k:06d}": k for side, k, _ in jobs}, []
-    for name, (side, k, shift) in zip(times, progress(jobs, "creating the built-in scene", quiet), strict=True):
+    num_static, frames, points = len(_static_bodies()), stereo_frames(scene.num_frames, BASELINE), []
+    for name, k, shift in progress(frames, "creating the built-in scene", quiet):
         camera, image, depth, bodies = trace(k / (scene.num_frames - 1), shift, scene, device)
         static = bodies < num_static
         writer.write_image(folder, name, to_bytes(image))
         writer.write_mask(folder, name, static.numpy())
         lens = Lens.pinhole(camera.K, camera.size)
         writer.write_camera(folder, name, lens, camera.viewmat[:3, :3].numpy(), camera.position.numpy())
-        if side == "left":
+        if not shift:
             writer.write_depth(folder, name, _monocular(depth, k / scene.num_frames))
             points.append(_surface_points(depth, static, camera, k, scene))
     units = SceneUnits(np.array(CENTER), SCALE)
     writer.write_scene(folder, units, torch.cat(points)[: scene.num_points].numpy(), near=0.05, far=4.0)
-    right = {name: int(name.startswith("right")) for name in times}
-    writer.write_index(folder, times, [name for name in times if right[name]], right)
+    write_stereo_index(folder, frames)
 
 
 def _monocular(depth: Tensor, phase: float) -> np.ndarray:

@@ -35,7 +35,7 @@ from .bodies import Body, as_tensors, euler, even_samples
 from .cache import cached, content_folder
 from .degraded_depth import DegradedDepth
 from .raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
-from .room import BuiltinScene
+from .room import BuiltinScene, stereo_frames, write_stereo_index
 
 Depth = Literal["exact", "network", "none"]
 
@@ -140,27 +140,21 @@ def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:
         ValueError: If there are fewer than two frames.
         OSError: If a file cannot be written; the message names it.
     """
-    if size.num_frames < 2:
-        raise ValueError(f"the studio needs at least 2 frames, got {size.num_frames}")
-    jobs = [("left", k, 0.0) for k in range(size.num_frames)]
-    jobs += [("right", k, BASELINE) for k in range(0, size.num_frames, 2)]
-    times, points = {f"{side}_{k:06d}": k for side, k, _ in jobs}, []
-    label = "creating builtin:studio, once for all runs"
-    for name, (side, k, shift) in zip(times, progress(jobs, label, quiet), strict=True):
+    frames, points = stereo_frames(size.num_frames, BASELINE), []
+    for name, k, shift in progress(frames, "creating builtin:studio, once for all runs", quiet):
         time = k / (size.num_frames - 1)
         image, depth, static = trace(time, shift, size)
         rotation, position = _pose(time, shift)
         writer.write_image(folder, name, to_bytes(image))
         writer.write_mask(folder, name, static.numpy())
         writer.write_camera(folder, name, _lens(size), rotation.round(9), position.round(9))
-        if side == "left":
+        if not shift:
             inverse = 1.0 / depth.numpy().astype(np.float64)
             writer.write_depth(folder, name, _sixteen_bits(inverse, k / size.num_frames))
             points.append(_surface_points(inverse, static.numpy(), rotation, position, k, size))
     units = SceneUnits(np.array(CENTER), SCALE)
     writer.write_scene(folder, units, np.concatenate(points)[: size.num_points], near=0.05, far=3.0)
-    right = {name: int(name.startswith("right")) for name in times}
-    writer.write_index(folder, times, [name for name in times if right[name]], right)
+    write_stereo_index(folder, frames)
 
 
 def _lens(size: StudioSize) -> Lens:
