@@ -1,9 +1,9 @@
 """EWA projection of 3D Gaussians to splats (Zwicker et al. 2001; 3DGS Eq. 5; paper Eq. 3) and its backward pass.
 
-With the camera's rotation W and translation, t = W mean + translation, depth z = t_z, u = t_x / z, v = t_y / z:
+With the camera's rotation W and translation, t = W mean + translation, and the lens' point and Jacobian J at t
+(``lens_pinhole`` and the other files of this name):
 
-    mean2d = (f_x u + c_x, f_y v + c_y) + offset · (width, height) / 2
-    J      = [[f_x / z, 0, -f_x ū / z], [0, f_y / z, -f_y v̄ / z]],  ū, v̄ = u, v clamped to a margin around the image
+    mean2d = point + offset · (width, height) / 2
     B      = J W R(q) diag(s),   cov2d = B Bᵀ = [[a', b], [b, c']],   a = a' + LOW_PASS, c = c' + LOW_PASS
     conic  = cov2d⁻¹ = [c, -b, a] / det,   det = a c - b²
     compensation = sqrt(det' / det), det' = a' c' - b²   (Mip-Splatting, Eq. 9: opacity of the unblurred splat)
@@ -20,11 +20,12 @@ a splat's elongation: at 200:1 it leaves nothing of the gradient of the length i
 product of scaled axes, cancels little.
 Through t, with v_t: v_mean = Wᵀ v_t, and for the camera the sums over all Gaussians of
     v_W = v_t meanᵀ + Jᵀ v_(JW),  v_translation = v_t
-and what f_x, f_y, c_x, c_y get through mean2d, J and, where ū or v̄ is clamped, through the margin of the image.
+and what the intrinsics and the distortion get through the point and J. Warp derives these, and v_t, from the lens.
 
-A Gaussian is culled (radius 0, everything else 0) unless it is beyond the near plane, closer than FAR, reaches
-ALPHA_MIN, has an opacity of at most 1 before compensation, touches the image and has a finite, invertible 2D
-covariance. Every test is phrased so that NaN fails it.
+A Gaussian is culled (radius 0, everything else 0) unless it is beyond the near plane (for a wide lens, farther than
+that from the camera, and within the lens' largest angle), closer than FAR, reaches ALPHA_MIN, has an opacity of at
+most 1 before compensation, touches the image and has a finite, invertible 2D covariance. Every test is phrased so that
+NaN fails it.
 """
 
 import functools
@@ -32,25 +33,18 @@ import math
 
 import warp as wp
 
-from .constants import ALPHA_MIN, FAR, FIELD_OF_VIEW_MARGIN, LOW_PASS
+from .constants import ALPHA_MIN, FAR, LOW_PASS
+from .lens import Distortion, mat23
+from .lenses import LENSES, LensKernels
 from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd, scaled_rotation
 from .rows import Splat, is_culled, make_pack_splat, make_unpack_splat
 
-CAMERA_GRADIENTS = 16
-"""Length of a row of ``v_cameras``: v_W by rows, v_translation, v of f_x, f_y, c_x, c_y."""
-
-mat23 = wp.types.matrix(shape=(2, 3), dtype=float)
+CAMERA_GRADIENTS = wp.constant(16)
+"""Length of a row of ``v_cameras`` without distortion: v_W by rows, v_translation, v of f_x, f_y, c_x, c_y."""
 
 LOG_ALPHA_MIN = wp.constant(math.log(ALPHA_MIN))
 MAX_EXTENT = wp.constant(1.0e8)
 """Half extent [px] above which a splat is culled: it must fit an int32, and float32 does not resolve such pixels."""
-
-
-@wp.func
-def clamped_slope(slope: float, size: float, focal: float, center: float) -> float:
-    """x / z, clamped to FIELD_OF_VIEW_MARGIN around the image, beyond which the local affine approximation fails."""
-    margin = FIELD_OF_VIEW_MARGIN * 0.5 * size / focal
-    return wp.clamp(slope, -center / focal - margin, (size - center) / focal + margin)
 
 
 @wp.func
@@ -74,102 +68,146 @@ def camera_translation(viewmat: wp.array2d[float]) -> wp.vec3:
 
 
 @wp.func
-def projection_jacobian(t: wp.vec3, fx: float, fy: float, u: float, v: float) -> mat23:
-    """J at camera-space point t, with the clamped slopes u and v."""
-    rz = 1.0 / t[2]
-    return mat23(fx * rz, 0.0, -fx * u * rz, 0.0, fy * rz, -fy * v * rz)
-
-
-@wp.func
 def store_camera_gradients(
     v_cameras: wp.array2d[float],
     i: int,
     mean: wp.vec3,
     v_t: wp.vec3,
     v_rotation: wp.mat33,
-    v_intrinsics: wp.vec4,
+    v_focal: wp.vec2,
+    v_center: wp.vec2,
+    v_distortion: Distortion,
 ):
     """Row i of ``v_cameras``; ``v_rotation`` is the part of v_W that does not pass through t."""
     for row in range(3):
         for column in range(3):
             v_cameras[i, 3 * row + column] = v_t[row] * mean[column] + v_rotation[row, column]
         v_cameras[i, 9 + row] = v_t[row]
-    for part in range(4):
-        v_cameras[i, 12 + part] = v_intrinsics[part]
+    for axis in range(2):
+        v_cameras[i, 12 + axis] = v_focal[axis]
+        v_cameras[i, 14 + axis] = v_center[axis]
+    for part in range(v_cameras.shape[1] - CAMERA_GRADIENTS):
+        v_cameras[i, CAMERA_GRADIENTS + part] = v_distortion[part]
 
 
 @wp.func
-def project(
-    i: int,
-    means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
-    scales: wp.array[wp.vec3],
-    opacities: wp.array[float],
-    viewmat: wp.array2d[float],
-    K: wp.array2d[float],
-    width: int,
-    height: int,
-    near: float,
-    compensate: int,
-    screen_offsets: wp.array[wp.vec2],
-) -> Splat:
-    """The splat of Gaussian i; ``screen_offsets`` may be missing (an empty array)."""
-    splat = Splat()
-    rotation = camera_rotation(viewmat)
-    t = rotation * means[i] + camera_translation(viewmat)
-    if not (t[2] > near and wp.length_sq(t) < FAR * FAR and wp.length_sq(quats[i]) > 0.0):
-        return splat
-    fx = K[0, 0]
-    fy = K[1, 1]
-    cx = K[0, 2]
-    cy = K[1, 2]
-    u = t[0] / t[2]
-    v = t[1] / t[2]
-    jacobian = projection_jacobian(
-        t, fx, fy, clamped_slope(u, float(width), fx, cx), clamped_slope(v, float(height), fy, cy)
-    )
-    spread = (jacobian * rotation) * scaled_rotation(quats[i], scales[i])
-    a_sharp = wp.dot(spread[0], spread[0])
-    b = wp.dot(spread[0], spread[1])
-    c_sharp = wp.dot(spread[1], spread[1])
-    a = a_sharp + LOW_PASS
-    c = c_sharp + LOW_PASS
-    # a c - b² in a form that cancels less: both Gram determinants are sums of squares.
-    det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
-    det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
-    opacity = opacities[i]
-    if compensate != 0:
-        opacity = opacity * wp.sqrt(det_sharp / det)
-    if not (opacity >= wp.static(ALPHA_MIN) and opacities[i] <= 1.0):
-        return splat
-    reach = wp.sqrt(2.0 * (wp.log(opacity) - LOG_ALPHA_MIN))
-    radius_x = wp.ceil(reach * wp.sqrt(a))
-    radius_y = wp.ceil(reach * wp.sqrt(c))
-    mean2d = wp.vec2(fx * u + cx, fy * v + cy)
-    if screen_offsets.shape[0] > 0:
-        offset = screen_offsets[i]
-        mean2d += wp.vec2(0.5 * float(width) * offset[0], 0.5 * float(height) * offset[1])
-    if not (
-        mean2d[0] + radius_x > 0.0
-        and mean2d[0] - radius_x < float(width)
-        and mean2d[1] + radius_y > 0.0
-        and mean2d[1] - radius_y < float(height)
-        and radius_x < MAX_EXTENT
-        and radius_y < MAX_EXTENT
-    ):
-        return splat
-    splat.mean = mean2d
-    splat.conic = wp.vec3(c / det, -b / det, a / det)
-    splat.depth = t[2]
-    splat.opacity = opacity
-    splat.radius = wp.vec2i(wp.max(int(radius_x), 1), wp.max(int(radius_y), 1))
-    return splat
+def focal_lengths(K: wp.array2d[float]) -> wp.vec2:
+    return wp.vec2(K[0, 0], K[1, 1])
+
+
+@wp.func
+def principal_point(K: wp.array2d[float]) -> wp.vec2:
+    return wp.vec2(K[0, 2], K[1, 2])
+
+
+@wp.func
+def load_distortion(distortion: wp.array[float]) -> Distortion:
+    """Coefficients of the lens; the array may be missing."""
+    coefficients = Distortion()
+    for k in range(distortion.shape[0]):
+        coefficients[k] = distortion[k]
+    return coefficients
 
 
 @functools.cache
-def make_project_fwd(num_features: int, with_depth: bool) -> wp.Kernel:
+def make_project(lens: LensKernels) -> wp.Function:
+    """Function that projects one Gaussian."""
+    lens_point, is_wide = lens.point, lens.is_wide
+
+    @wp.func
+    def project(
+        i: int,
+        means: wp.array[wp.vec3],
+        quats: wp.array[wp.vec4],
+        scales: wp.array[wp.vec3],
+        opacities: wp.array[float],
+        viewmat: wp.array2d[float],
+        K: wp.array2d[float],
+        width: int,
+        height: int,
+        distortion: wp.array[float],
+        limit: float,
+        near: float,
+        compensate: int,
+        screen_offsets: wp.array[wp.vec2],
+    ) -> Splat:
+        """The splat of Gaussian i; ``screen_offsets`` may be missing (an empty array)."""
+        splat = Splat()
+        rotation = camera_rotation(viewmat)
+        t = rotation * means[i] + camera_translation(viewmat)
+        depth = t[2]
+        if wp.static(is_wide):
+            depth = wp.length(t)
+            if not (t[2] > depth * wp.cos(limit)):
+                return splat
+        if not (depth > near and wp.length_sq(t) < FAR * FAR and wp.length_sq(quats[i]) > 0.0):
+            return splat
+        size = wp.vec2(float(width), float(height))
+        mean2d, jacobian = lens_point(t, focal_lengths(K), principal_point(K), size, load_distortion(distortion), limit)
+        spread = (jacobian * rotation) * scaled_rotation(quats[i], scales[i])
+        a_sharp = wp.dot(spread[0], spread[0])
+        b = wp.dot(spread[0], spread[1])
+        c_sharp = wp.dot(spread[1], spread[1])
+        a = a_sharp + LOW_PASS
+        c = c_sharp + LOW_PASS
+        # a c - b² in a form that cancels less: both Gram determinants are sums of squares.
+        det_sharp = wp.length_sq(wp.cross(spread[0], spread[1]))
+        det = det_sharp + LOW_PASS * (a_sharp + c_sharp + LOW_PASS)
+        opacity = opacities[i]
+        if compensate != 0:
+            opacity = opacity * wp.sqrt(det_sharp / det)
+        if not (opacity >= wp.static(ALPHA_MIN) and opacities[i] <= 1.0):
+            return splat
+        reach = wp.sqrt(2.0 * (wp.log(opacity) - LOG_ALPHA_MIN))
+        radius_x = wp.ceil(reach * wp.sqrt(a))
+        radius_y = wp.ceil(reach * wp.sqrt(c))
+        if screen_offsets.shape[0] > 0:
+            mean2d += wp.cw_mul(0.5 * size, screen_offsets[i])
+        if not (
+            mean2d[0] + radius_x > 0.0
+            and mean2d[0] - radius_x < size[0]
+            and mean2d[1] + radius_y > 0.0
+            and mean2d[1] - radius_y < size[1]
+            and radius_x < MAX_EXTENT
+            and radius_y < MAX_EXTENT
+        ):
+            return splat
+        splat.mean = mean2d
+        splat.conic = wp.vec3(c / det, -b / det, a / det)
+        splat.depth = depth
+        splat.opacity = opacity
+        splat.radius = wp.vec2i(wp.max(int(radius_x), 1), wp.max(int(radius_y), 1))
+        return splat
+
+    return project
+
+
+@functools.cache
+def make_lens_sum(lens: LensKernels) -> wp.Function:
+    """Function whose gradient is the backward pass of a lens: v_point · point and v_jacobian : J."""
+    lens_point = lens.point
+
+    @wp.func
+    def lens_sum(
+        t: wp.vec3,
+        focal: wp.vec2,
+        center: wp.vec2,
+        size: wp.vec2,
+        distortion: Distortion,
+        limit: float,
+        v_point: wp.vec2,
+        v_jacobian: mat23,
+    ) -> wp.vec2:
+        point, jacobian = lens_point(t, focal, center, size, distortion, limit)
+        return wp.vec2(wp.dot(v_point, point), wp.ddot(v_jacobian, jacobian))
+
+    return lens_sum
+
+
+@functools.cache
+def make_project_fwd(num_features: int, with_depth: bool, lens: str = "pinhole") -> wp.Kernel:
     """Kernel that projects Gaussians and packs them, one thread for each."""
-    pack_splat = make_pack_splat(num_features, with_depth)
+    pack_splat, project = make_pack_splat(num_features, with_depth), make_project(LENSES[lens])
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_fwd(
@@ -182,6 +220,8 @@ def make_project_fwd(num_features: int, with_depth: bool) -> wp.Kernel:
         K: wp.array2d[float],
         width: int,
         height: int,
+        distortion: wp.array[float],
+        limit: float,
         near: float,
         compensate: int,
         screen_offsets: wp.array[wp.vec2],
@@ -194,7 +234,22 @@ def make_project_fwd(num_features: int, with_depth: bool) -> wp.Kernel:
         sort_counters: wp.array[int],
     ):
         i = first + wp.tid()
-        splat = project(i, means, quats, scales, opacities, viewmat, K, width, height, near, compensate, screen_offsets)
+        splat = project(
+            i,
+            means,
+            quats,
+            scales,
+            opacities,
+            viewmat,
+            K,
+            width,
+            height,
+            distortion,
+            limit,
+            near,
+            compensate,
+            screen_offsets,
+        )
         if not pack_splat(i, splat, features, rows, depth_keys, gaussian_from_rank, scan_words, sort_counters):
             splat.radius = wp.vec2i(0, 0)
         radii[i] = splat.radius
@@ -203,9 +258,10 @@ def make_project_fwd(num_features: int, with_depth: bool) -> wp.Kernel:
 
 
 @functools.cache
-def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
+def make_project_bwd(num_features: int, with_depth: bool, lens: str = "pinhole") -> wp.Kernel:
     """Kernel that turns gradient rows into the gradients of the Gaussians, one thread for each."""
-    unpack_splat = make_unpack_splat(num_features, with_depth)
+    unpack_splat, is_wide = make_unpack_splat(num_features, with_depth), LENSES[lens].is_wide
+    lens_sum = make_lens_sum(LENSES[lens])
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_bwd(
@@ -218,6 +274,8 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
         K: wp.array2d[float],
         width: int,
         height: int,
+        distortion: wp.array[float],
+        limit: float,
         compensate: int,
         rows: wp.array2d[wp.vec4],
         gradients: wp.array2d[wp.vec4],
@@ -242,14 +300,14 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
             return
         rotation = camera_rotation(viewmat)
         t = rotation * means[i] + camera_translation(viewmat)
-        fx = K[0, 0]
-        fy = K[1, 1]
-        rz = 1.0 / t[2]
-        slope_u = t[0] * rz
-        slope_v = t[1] * rz
-        u = clamped_slope(slope_u, float(width), fx, K[0, 2])
-        v = clamped_slope(slope_v, float(height), fy, K[1, 2])
-        jacobian = projection_jacobian(t, fx, fy, u, v)
+        focal = focal_lengths(K)
+        center = principal_point(K)
+        size = wp.vec2(float(width), float(height))
+        coefficients = load_distortion(distortion)
+        # The gradient by v_jacobian is J. After a plain call of the lens, Warp 1.19 would make no adjoint of it.
+        _t, _focal, _center, _size, _distortion, _limit, _point, jacobian = wp.grad(lens_sum)(
+            t, focal, center, size, coefficients, limit, wp.vec2(0.0), mat23(0.0)
+        )
         to_image = jacobian * rotation
         q = quats[i]
         s = scales[i]
@@ -292,36 +350,16 @@ def make_project_bwd(num_features: int, with_depth: bool) -> wp.Kernel:
 
         v_to_image = v_spread * wp.transpose(shape)
         v_jacobian = v_to_image * wp.transpose(rotation)
-        v_mean2d = v_splat.mean
-        # The centre depends on the slope t_x / z itself, the Jacobian on the clamped slope, constant where clamped.
-        v_u = fx * v_mean2d[0]
-        v_v = fy * v_mean2d[1]
-        if u == slope_u:
-            v_u -= fx * rz * v_jacobian[0, 2]
-        if v == slope_v:
-            v_v -= fy * rz * v_jacobian[1, 2]
-        v_z = -rz * (
-            jacobian[0, 0] * v_jacobian[0, 0]
-            + jacobian[0, 2] * v_jacobian[0, 2]
-            + jacobian[1, 1] * v_jacobian[1, 1]
-            + jacobian[1, 2] * v_jacobian[1, 2]
+        v_t, v_focal, v_center, _size, v_distortion, _limit, _point, _jacobian = wp.grad(lens_sum)(
+            t, focal, center, size, coefficients, limit, v_splat.mean, v_jacobian
         )
-        v_z += v_splat.depth
-        v_t = wp.vec3(rz * v_u, rz * v_v, v_z - rz * (slope_u * v_u + slope_v * v_v))
+        if wp.static(is_wide):
+            v_t += v_splat.depth * wp.normalize(t)
+        else:
+            v_t += wp.vec3(0.0, 0.0, v_splat.depth)
         v_means[i] = wp.transpose(rotation) * v_t
         if v_cameras.shape[1] > 0:
-            v_fx = slope_u * v_mean2d[0] + rz * (v_jacobian[0, 0] - u * v_jacobian[0, 2])
-            v_fy = slope_v * v_mean2d[1] + rz * (v_jacobian[1, 1] - v * v_jacobian[1, 2])
-            v_cx = v_mean2d[0]
-            v_cy = v_mean2d[1]
-            # A clamped slope is (constant - c) / f.
-            if u != slope_u:
-                v_fx += rz * u * v_jacobian[0, 2]
-                v_cx += rz * v_jacobian[0, 2]
-            if v != slope_v:
-                v_fy += rz * v * v_jacobian[1, 2]
-                v_cy += rz * v_jacobian[1, 2]
             v_rotation = wp.transpose(jacobian) * v_to_image
-            store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, wp.vec4(v_fx, v_fy, v_cx, v_cy))
+            store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, v_focal, v_center, v_distortion)
 
     return project_bwd

@@ -12,6 +12,7 @@ from warpgs.kernels.rows import gradient_stride
 from warpgs.ops.projection import Geometry, View, project_bwd, project_fwd
 
 CAMERA = make_camera()
+VIEW = View(CAMERA.viewmat, CAMERA.K, *CAMERA.size)
 NUM = 150
 
 
@@ -21,8 +22,7 @@ def inputs():
 
 
 def project_here(*tensors, near=0.01, antialias=False):
-    view = View(CAMERA.viewmat, CAMERA.K, *CAMERA.size)
-    return project(Geometry(*tensors), view, near=near, antialias=antialias)
+    return project(Geometry(*tensors), VIEW, near=near, antialias=antialias)
 
 
 def reference_here(*tensors, near=0.01, antialias=False):
@@ -54,20 +54,26 @@ def random_gradient_rows(num: int, *outputs: str) -> torch.Tensor:
     return v_rows
 
 
-def assert_same_gradients(tensors, camera, v_rows, antialias, of_camera=False):
-    """Compares the backward pass with that of the reference in double precision; returns what is visible."""
-    view = View(*(t.clone().requires_grad_(of_camera) for t in (camera.viewmat, camera.K)), *camera.size)
-    features = torch.zeros(len(tensors[0]), 1)
-    rows, *_ = project_fwd(Geometry(*tensors), features, view, 0.01, antialias, with_depth=True)
-    v = project_bwd(Geometry(*tensors), view, antialias, rows, v_rows)
+def gradients(tensors, view, v_rows, antialias=False):
+    """Gradients of the inputs of a projection for gradients of its rows."""
+    rows, *_ = project_fwd(Geometry(*tensors), torch.zeros(len(tensors[0]), 1), view, 0.01, antialias, with_depth=True)
+    return project_bwd(Geometry(*tensors), view, antialias, rows, v_rows)
 
-    doubles = [t.double().requires_grad_() for t in (*tensors, camera.viewmat, camera.K)]
-    *values, visible = reference(Geometry(*doubles[:4]), View(*doubles[4:], *camera.size), antialias=antialias)
+
+def assert_same_gradients(tensors, view, v_rows, antialias, of_camera=False):
+    """Compares the backward pass with that of the reference in double precision; returns what is visible."""
+    names = [name for name in ("viewmat", "K", "distortion") if getattr(view, name) is not None]
+    parts = {name: getattr(view, name).clone().requires_grad_(of_camera) for name in names}
+    v = gradients(tensors, view._replace(**parts), v_rows, antialias)
+
+    doubles = [t.double().requires_grad_() for t in (*tensors, *(getattr(view, name) for name in names))]
+    double_view = view._replace(**dict(zip(names, doubles[4:], strict=True)))
+    *values, visible = reference(Geometry(*doubles[:4]), double_view, antialias=antialias)
     v_means2d, v_conics, v_opacities = rows_reference.splat_gradients(values[1], values[3], v_rows[0, :, 2:].double())
     v_values = [t[visible].detach() for t in (v_means2d, v_conics, v_rows[0, :, 1].double(), v_opacities)]
     weighted_sum((value[visible] for value in values), v_values).backward()
     pairs = [*zip(v.geometry, doubles, strict=False)]
-    pairs += [*zip((v.viewmat, v.K), doubles[4:], strict=True)] if of_camera else []
+    pairs += [*zip((getattr(v, name) for name in names), doubles[4:], strict=True)] if of_camera else []
     for actual, double in pairs:
         assert (actual - double.grad).norm() <= 1e-5 * double.grad.norm()
     return visible
@@ -76,7 +82,7 @@ def assert_same_gradients(tensors, camera, v_rows, antialias, of_camera=False):
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("output", OUTPUTS)
 def test_the_gradient_of_each_output_equals_the_reference(output, antialias):
-    visible = assert_same_gradients(inputs(), CAMERA, random_gradient_rows(NUM, output), antialias)
+    visible = assert_same_gradients(inputs(), VIEW, random_gradient_rows(NUM, output), antialias)
     assert 10 < visible.sum() < NUM
 
 
@@ -92,13 +98,13 @@ def test_slopes_outside_the_margin_use_the_clamped_jacobian():
     *values, visible = reference_here(*(t.double() for t in tensors))
     assert visible.all()
     assert relative_error(splats.conics, values[1]) < 2e-6
-    assert_same_gradients(tensors, CAMERA, random_gradient_rows(4), antialias=False)
+    assert_same_gradients(tensors, VIEW, random_gradient_rows(4), antialias=False)
 
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradients_of_the_camera_equal_the_reference(antialias):
     geometry = [torch.cat(pair) for pair in zip(inputs(), far_out_inputs(), strict=True)]
-    visible = assert_same_gradients(geometry, CAMERA, random_gradient_rows(NUM + 4), antialias, of_camera=True)
+    visible = assert_same_gradients(geometry, VIEW, random_gradient_rows(NUM + 4), antialias, of_camera=True)
     assert visible[-4:].all()
 
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from tests.reference import lenses
 from tests.reference.covariance import covariance
 from warpgs.ops.projection import Geometry, View
 
@@ -18,7 +19,7 @@ class Projection(NamedTuple):
     Attributes:
         means2d: [N, 2] centres [px].
         conics: [N, 3] entries xx, xy, yy of the inverse 2D covariance [1/px²].
-        depths: [N] z in camera space [scene units].
+        depths: [N] z in camera space, for a fisheye lens the distance from the camera [scene units].
         opacities: [N] in [0, 1], with antialiasing compensated for the low-pass filter.
         radii: [N, 2] int32 half sizes on screen [px]; 0 = culled.
     """
@@ -35,18 +36,11 @@ def project(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """means2d, conics, depths, opacities, visible [N] bool. Values of invisible Gaussians are undefined."""
     means, quats, scales, opacities = geometry
-    viewmat, K, width, height = view
-    W, translation = viewmat[:3, :3], viewmat[:3, 3]
+    W, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
     t = means @ W.T + translation
-    x, y, z = t.unbind(-1)
-    in_front = z > near
-    z = torch.where(in_front, z, torch.ones_like(z))
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
-    u = (x / z).clamp(min=-cx / fx - margin_x, max=(width - cx) / fx + margin_x)
-    v = (y / z).clamp(min=-cy / fy - margin_y, max=(height - cy) / fy + margin_y)
-    zero = torch.zeros_like(z)
-    J = torch.stack([fx / z, zero, -fx * u / z, zero, fy / z, -fy * v / z], -1).reshape(-1, 2, 3)
+    depth, seen = depth_and_visibility(t, view, near)
+    t = torch.where(seen[:, None], t, torch.tensor([0.1, 0.1, 1.0], dtype=t.dtype))
+    means2d, J = lenses.point_and_jacobian(t, view)
     sharp = J @ W @ covariance(quats, scales) @ W.T @ J.mT
     blurred = sharp + LOW_PASS * torch.eye(2, dtype=means.dtype)
     det = torch.linalg.det(blurred)
@@ -54,10 +48,17 @@ def project(
         opacities = opacities * (torch.linalg.det(sharp) / det).clamp(min=0).sqrt()
     inverse = torch.linalg.inv(blurred)
     conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], -1)
-    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
     reach = (2 * (opacities.detach() / ALPHA_MIN).clamp(min=1).log()).sqrt()
     radii = (reach[:, None] * blurred.detach().diagonal(dim1=1, dim2=2).sqrt()).ceil()
-    limit = torch.tensor([width, height], dtype=means.dtype)
+    limit = torch.tensor([view.width, view.height], dtype=means.dtype)
     on_screen = ((means2d + radii > 0) & (means2d - radii < limit)).all(-1)
-    visible = in_front & on_screen & (opacities >= ALPHA_MIN)
-    return means2d, conics, z, opacities, visible
+    visible = seen & on_screen & (opacities >= ALPHA_MIN)
+    return means2d, conics, depth, opacities, visible
+
+
+def depth_and_visibility(t: Tensor, view: View, near: float) -> tuple[Tensor, Tensor]:
+    """[N] depths, the distance from a fisheye camera, and whether the lens sees them at all."""
+    if view.lens != "fisheye":
+        return t[:, 2], t[:, 2] > near
+    distance = t.norm(dim=1)
+    return distance, (distance > near) & (torch.acos(t[:, 2] / distance) < view.limit)

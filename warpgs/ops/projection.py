@@ -29,18 +29,25 @@ class Geometry(NamedTuple):
 
 
 class View(NamedTuple):
-    """A pinhole camera.
+    """A camera.
 
     Attributes:
         viewmat: [4, 4] rigid world-to-camera transform, x right, y down, z forward.
         K: [3, 3] intrinsics [px] with pixel centres at +0.5; skew is not used.
         width, height: Size of the image [px].
+        distortion: [C] coefficients of the lens, in the order of its kernel; None for a pinhole.
+        limit: How far from the axis the lens' formula holds: a radius on the plane z = 1 (radial), or an angle
+            (fisheye) [radians], beyond which nothing is seen.
+        lens: Name of the lens, a key of ``kernels.lenses.LENSES``.
     """
 
     viewmat: Float[Tensor, "4 4"]
     K: Float[Tensor, "3 3"]
     width: int
     height: int
+    distortion: Float[Tensor, " C"] | None = None
+    limit: float = 0.0
+    lens: str = "pinhole"
 
 
 class SplatGradients(NamedTuple):
@@ -51,6 +58,7 @@ class SplatGradients(NamedTuple):
     viewmat: Tensor | None
     K: Tensor | None
     screen_offsets: Tensor | None
+    distortion: Tensor | None = None
 
 
 def project_fwd(
@@ -62,7 +70,7 @@ def project_fwd(
     with_depth: bool,
     screen_offsets: Tensor | None = None,
 ) -> tuple[Rows, Tensor, DepthOrder]:
-    """Projects Gaussians into a pinhole camera and packs the splats.
+    """Projects Gaussians into a camera and packs the splats.
 
     Gaussians that are at the near plane or behind it, 1e10 or more from the camera, outside the image, fainter than
     1/255 or that have an opacity above 1, a value that is not finite, or a conic that is singular in single precision
@@ -82,8 +90,8 @@ def project_fwd(
         of binning.
     """
     rows, radii = new_rows(features, with_depth), features.new_empty(features.shape[0], 2, dtype=int32)
-    order, kernel = new_order(radii), kernels.make_project_fwd(rows.num_features, with_depth)
-    inputs = (*geometry, *view, near, int(antialias), screen_offsets, features)
+    order, kernel = new_order(radii), kernels.make_project_fwd(rows.num_features, with_depth, view.lens)
+    inputs = (*geometry, *view[:-1], near, int(antialias), screen_offsets, features)
     launch(kernel, features.shape[0], *inputs, radii, rows.packed, *order)
     return rows, radii, order
 
@@ -109,19 +117,22 @@ def project_bwd(
     new, N = geometry.means.new_empty, geometry.means.shape[0]
     v_geometry = Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))  # torch.empty_like takes the host longer
     v_features, v_offsets = new(N, rows.num_features), new(N, 2) if with_offsets else None
-    v_cameras = new(N, kernels.CAMERA_GRADIENTS) if view.viewmat.requires_grad or view.K.requires_grad else None
+    is_trained = any(part is not None and part.requires_grad for part in (view.viewmat, view.K, view.distortion))
+    num_coefficients = 0 if view.distortion is None else len(view.distortion)
+    v_cameras = new(N, kernels.CAMERA_GRADIENTS + num_coefficients) if is_trained else None
     v_parts = v_rows.view(*v_rows.shape[:2], v_rows.shape[2] // 4, 4)  # pieces of 16 bytes
-    inputs = (*geometry, *view, int(antialias), rows.packed, v_parts, int(absgrad))
-    kernel = kernels.make_project_bwd(rows.num_features, rows.with_depth)
+    inputs = (*geometry, *view[:-1], int(antialias), rows.packed, v_parts, int(absgrad))
+    kernel = kernels.make_project_bwd(rows.num_features, rows.with_depth, view.lens)
     launch(kernel, N, *inputs, v_features, v_offsets, *v_geometry, v_cameras)
-    v_viewmat, v_K = (None, None) if v_cameras is None else _sum_over_gaussians(view, v_cameras)
-    return SplatGradients(v_geometry, v_features, v_viewmat, v_K, v_offsets)
+    camera = (None, None, None) if v_cameras is None else _sum_over_gaussians(view, v_cameras)
+    v_viewmat, v_K, v_distortion = camera
+    return SplatGradients(v_geometry, v_features, v_viewmat, v_K, v_offsets, v_distortion)
 
 
-def _sum_over_gaussians(view: View, v_cameras: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of ``viewmat`` and ``K`` from what each Gaussian contributes."""
+def _sum_over_gaussians(view: View, v_cameras: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of ``viewmat``, ``K`` and ``distortion`` from what each Gaussian contributes."""
     sums = v_cameras.sum(0)
     v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)  # their last rows are constant
     v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
-    v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:].unbind()
-    return v_viewmat, v_K
+    v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:16].unbind()
+    return v_viewmat, v_K, sums[16:]
