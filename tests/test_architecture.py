@@ -21,6 +21,7 @@ ORDER = [
     "rendering",
     "visualize",
     "data",
+    "download",
     "views",
     "synthetic",
     "captures",

@@ -46,6 +46,9 @@ COMMANDS = {
     "sample": Command(
         ".prepare.options:Sample", ".prepare.command:run_sample", "write a short video to try prepare on"
     ),
+    "download": Command(
+        ".download.options:Download", ".download.command:run", "download public captures: NeRF-DS, HyperNeRF, D-NeRF"
+    ),
     "prepare": Command(
         ".prepare.options:Prepare", ".prepare.command:run_prepare", "make a capture from a video or a folder of frames"
     ),

@@ -6,7 +6,7 @@ import pytest
 
 from tests.errors import error_line
 from warpgs.captures.opening import load_capture
-from warpgs.data.missing import PUBLISHED, published
+from warpgs.data.published import PUBLISHED, dataset_in
 
 NERFDS = "https://github.com/JokerYan/NeRF-DS"
 
@@ -32,16 +32,20 @@ def captures(*paths):
 @pytest.mark.parametrize(
     ("path", "source"),
     [
-        ("nerfds/as", NERFDS),
+        ("nerfds/as", "; warpgs download nerfds as downloads it; "),
+        ("/nowhere/nerfds/as", "; warpgs download nerfds as --to /nowhere downloads it; "),
+        ("data/NeRF-DS/as", "; warpgs download nerfds as --to data downloads it to data/nerfds/as; "),
+        ("nerfds", "; warpgs download nerfds downloads it; "),
+        ("data/nerf_ds", "; warpgs download nerfds --to data downloads it to data/nerfds; "),
+        ("hypernerf/hand", "; warpgs download hypernerf hand downloads it; "),
+        ("dnerf/hook", "; warpgs download dnerf hook downloads it; "),
         ("/nowhere/NeRF-DS/as_novel_view", NERFDS),
-        ("data/nerf_ds", NERFDS),
+        ("nerfds/as/rgb", NERFDS),
         ("hypernerf/vrig/vrig-chicken", "https://github.com/google/hypernerf/releases"),
-        ("HyperNeRF/espresso", "https://github.com/google/hypernerf/releases"),
-        ("nerfies/broom", "https://github.com/google/nerfies"),
+        ("nerfies/dog", "https://github.com/google/nerfies"),
         ("dycheck/iphone/spin", "https://github.com/KAIR-BAIR/dycheck"),
         ("iphone/paper-windmill", "https://github.com/KAIR-BAIR/dycheck"),
         ("D-NeRF/data/lego", "https://github.com/albertpumarola/D-NeRF"),
-        ("dnerf/hook", "https://github.com/albertpumarola/D-NeRF"),
         ("nvidia/Balloon1", "https://gorokee.github.io/jsyoon/dynamic_synth"),
         ("hand", "https://github.com/facebookresearch/nonrigid_nerf"),
         ("nonrigid_nerf/data/example_sequence", "https://github.com/facebookresearch/nonrigid_nerf"),
@@ -68,7 +72,7 @@ def test_other_paths_are_told_no_source(path):
 def test_a_folder_nearby_that_has_the_words_of_the_name_is_named(name):
     Path("nerfds", name).mkdir(parents=True)
     Path("nerfds/basin").mkdir()
-    assert message("nerfds/as").startswith(f"nerfds/as does not exist; did you mean nerfds/{name}? NeRF-DS is")
+    assert message("nerfds/as").startswith(f"nerfds/as does not exist; did you mean nerfds/{name}? warpgs download")
 
 
 def test_captures_farther_below_are_named_the_most_similar_first():
@@ -85,13 +89,16 @@ def test_folders_farther_below_that_are_no_captures_and_runs_are_not_named():
 
 @pytest.mark.parametrize(
     "arguments",
-    [["train", "--data", "nerfds/as"], ["check", "nerfds/as"], ["prepare", "nerfds/as", "--add", "depth"]],
+    [
+        *(["train", "--data", "nerfds/as"], ["check", "nerfds/as"], ["prepare", "nerfds/as", "--add", "depth"]),
+        ["sweep", "scenes", "--data", "nerfds/as", "--dry-run"],
+    ],
 )
 def test_every_command_says_so(capsys, arguments):
-    assert NERFDS in error_line(capsys, *arguments)
+    assert "; warpgs download nerfds as downloads it; " in error_line(capsys, *arguments)
 
 
 def test_names_of_datasets_are_those_that_paths_are_compared_with():
     for dataset in PUBLISHED:
         for part in dataset.parts:
-            assert published(Path(part, "scene")) == dataset
+            assert dataset_in(Path(part, "scene")) == dataset

@@ -1,13 +1,13 @@
-"""What to say of a capture that does not exist: similar folders nearby, and where a public dataset is published."""
+"""What to say of a capture that does not exist: similar folders nearby, and how to get a public dataset."""
 
 import os
-import re
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 from warpgs.errors import command, missing
+
+from .published import dataset_in, find_dataset, words
 
 CONFIG = "config.json"
 """File of a run folder, which is often named after its capture."""
@@ -22,44 +22,6 @@ MAX_DEPTH = 3
 """How far below the last folder of the path that exists it is looked for."""
 
 
-class Published(NamedTuple):
-    """A public dataset.
-
-    Attributes:
-        title: Its name.
-        address: Page that says how to download it.
-        parts: Its names in paths, of lower-case letters and digits alone.
-    """
-
-    title: str
-    address: str
-    parts: tuple[str, ...]
-
-
-PUBLISHED = (
-    Published("NeRF-DS", "https://github.com/JokerYan/NeRF-DS/releases/tag/v0.1-pre-release", ("nerfds",)),
-    Published("HyperNeRF", "https://github.com/google/hypernerf/releases/tag/v0.1", ("hypernerf",)),
-    Published("Nerfies", "https://github.com/google/nerfies/releases", ("nerfies",)),
-    Published(
-        "the iPhone dataset of DyCheck",
-        "https://github.com/KAIR-BAIR/dycheck/blob/main/docs/DATASETS.md",
-        ("dycheck", "iphone"),
-    ),
-    Published("D-NeRF", "https://github.com/albertpumarola/D-NeRF", ("dnerf",)),
-    Published(
-        "the NVIDIA Dynamic Scene dataset",
-        "https://gorokee.github.io/jsyoon/dynamic_synth",
-        ("nvidia", "nvidiadynamic", "nvidiadynamicscene", "dynamicscene"),
-    ),
-    Published(
-        "the example of NR-NeRF",
-        "https://github.com/facebookresearch/nonrigid_nerf",
-        ("nonrigidnerf", "nrnerf", "hand"),
-    ),
-)
-"""Datasets whose layouts are read."""
-
-
 def missing_folder(path: Path, is_capture: Callable[[Path], bool]) -> str:
     """Message that a folder of a capture does not exist: similar ones, or where to get it and how to do without.
 
@@ -70,9 +32,9 @@ def missing_folder(path: Path, is_capture: Callable[[Path], bool]) -> str:
     text = missing(path)
     if text == f"{path} does not exist" and (similar := similar_folders(path, is_capture)):
         text += f"; did you mean {' or '.join(map(str, similar))}?"
-    if (dataset := published(path)) is None:
+    if (dataset := dataset_in(path)) is None:
         return text
-    source = f"{dataset.title} is published at {dataset.address}"
+    source = download_of(path) or f"{dataset.title} is published at {dataset.address}"
     if text.endswith("?"):
         return f"{text} {source}"
     return (
@@ -81,13 +43,19 @@ def missing_folder(path: Path, is_capture: Callable[[Path], bool]) -> str:
     )
 
 
-def published(path: Path) -> Published | None:
-    """The public dataset that a path is named after, if any."""
-    for part in reversed(path.parts):
-        name = "".join(_words(part))
-        for dataset in PUBLISHED:
-            if name in dataset.parts:
-                return dataset
+def download_of(path: Path) -> str | None:
+    """How to download what a path names by its last parts, a dataset and a scene of it, or a dataset; None if neither.
+
+    The end of a message: the command, and the folder that it makes, unless that is the path.
+    """
+    for folder, scenes in ((path.parent, [path.name]), (path, [])):
+        dataset = find_dataset(folder.name)
+        if dataset and dataset.releases and set(scenes) <= set(dataset.scenes):
+            to = folder.parent
+            made = Path(to, dataset.name, *scenes)
+            options = [] if to.absolute() == Path.cwd() else ["--to", to]
+            place = "" if made == path else f" to {made}"
+            return f"{command('download', dataset.name, *scenes, *options)} downloads it{place}"
     return None
 
 
@@ -97,13 +65,13 @@ def similar_folders(path: Path, is_capture: Callable[[Path], bool]) -> list[Path
     They are in the last folder of the path that exists, or are captures farther below it; the most similar come first.
     """
     base = next((parent for parent in path.parents if os.path.isdir(parent)), Path())
-    given = _words(path.name)
+    given = words(path.name)
     found = []
     for folder in islice(_folders(base, MAX_DEPTH), MAX_FOLDERS):
-        words = _words(folder.name)
-        is_similar = given and words and (set(given) <= set(words) or set(words) <= set(given))
+        own = words(folder.name)
+        is_similar = given and own and (set(given) <= set(own) or set(own) <= set(given))
         if is_similar and (is_capture(folder) or (folder.parent == base and not (folder / CONFIG).exists())):
-            found.append(("".join(words) != "".join(given), len(folder.parts), folder))
+            found.append(("".join(own) != "".join(given), len(folder.parts), folder))
     return [folder for *_, folder in sorted(found)[:MAX_SIMILAR]]
 
 
@@ -127,7 +95,3 @@ def _in(folder: Path) -> list[Path]:
     except OSError:  # it cannot be read
         return []
     return [folder / name for name in names if not name.startswith(".")]
-
-
-def _words(name: str) -> list[str]:
-    return re.findall(r"[^\W_]+", name.lower())

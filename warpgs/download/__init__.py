@@ -1,0 +1,1 @@
+"""Public captures, downloaded as their authors released them."""
