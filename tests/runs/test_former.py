@@ -291,5 +291,5 @@ def test_sizes_of_a_run_of_version_0_3_stay_fractions_of_the_extent(run):
 @pytest.mark.parametrize(("dense_fraction", "max_size"), [(0.02, 0.1), (0.01, 0.2)])
 def test_a_run_of_version_0_3_with_other_sizes_is_not_resumed(run, dense_fraction, max_size):
     edit(run, lambda values: reduce_to_version_0_3(values, dense_fraction, max_size))
-    with pytest.raises(ValueError, match=r"cannot be resumed: densify\.\w+ is 0\.\d+; .*sizes are those of 3DGS"):
+    with pytest.raises(ValueError, match=r"cannot be resumed: densify\.\w+ is 0\.\d+; .*--densify.unit says all sizes"):
         require_resumable(run)

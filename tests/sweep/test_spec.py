@@ -52,6 +52,8 @@ def test_a_number_of_seeds_counts_from_0(tmp_path):
     ("text", "message"),
     [
         ("variants.a.losss.ssim = 1", r"rates.toml: variant a: there is no option losss; did you mean loss\?$"),
+        ("variants.a.dap = false", r"variant a: there is no option dap any more: --omit dap omits it$"),
+        ("variants.a.masks.erode = 4", r"variant a: there is no option masks any more: --damage-masks is for that$"),
         ("variants.a.loss.sim = 1", r"rates.toml: variant a: there is no option loss.sim; did you mean loss\.ssim\?$"),
         ("variants.a.loss = 1", r"rates.toml: variant a: loss must be a table, got 1"),
         ("variants.a.seed = 1", r"variant a: seed is not an option of one training"),

@@ -14,7 +14,7 @@ from warpgs.config.builtin import is_builtin
 from warpgs.errors import missing, suggestion
 from warpgs.files import read_json, write_text
 
-from .former import FORMER, RENAMED, as_today, former_option, not_kept
+from .former import FORMER, RENAMED, as_today, not_kept
 
 NAME, START = "config.json", "start.json"
 MAX_BYTES = 1 << 20
@@ -132,8 +132,7 @@ def _parse(cls: Any, values: Any, path: Path | str, prefix: str = "") -> Any:
     values = {RENAMED.get(name, name): value for name, value in values.items()}
     hints = typing.get_type_hints(cls)
     if unknown := sorted(set(values) - set(hints)):
-        name = f"{prefix}{unknown[0]}"
-        close = former_option(name) or suggestion(unknown[0], set(hints) - set(values))
+        close = suggestion(unknown[0], set(hints) - set(values))
         raise ValueError(f"{path} has fields of another version: {', '.join(unknown):.200}{close}")
     values = FORMER.get(prefix.rstrip("."), {}) | values
     if lacking := [name for name in hints if name not in values]:

@@ -28,6 +28,13 @@ def _always(constant: float) -> Removed:
     return Removed(f"it is always {constant:g}", lambda value, section: value == constant)
 
 
+def _sizes(in_pixels: float, of_extent: float) -> Removed:
+    def is_kept(value: Any, densify: dict[str, Any]) -> bool:
+        return bool(value == (in_pixels if densify.get("unit") == "pixel" else of_extent))
+
+    return Removed("--densify.unit says all sizes", is_kept)
+
+
 COMPONENTS = ("dap", "vdp", "app", "stage2")
 """Components of the paper, each of which had a switch."""
 
@@ -35,33 +42,23 @@ FROZEN = {(True, True): "nothing", (False, True): "geometry", (True, False): "ap
 """What stage II kept of static Gaussians, by whether it optimized their geometry and their appearance."""
 
 DAMAGE = {"erode": "PIXELS", "dilate": "PIXELS", "holes": "FRACTION"}
-
-SIZES = "sizes are those of 3DGS, in the unit of densify.unit"
-
-
-def in_pixels(densify: dict[str, Any]) -> bool:
-    """Whether sizes of Gaussians are in pixels."""
-    return bool(densify.get("unit") == "pixel")
-
+"""Kinds of damage to masks, each of which had an option, and what it was measured in."""
 
 REMOVED: dict[str, Removed] = {
+    **{name: Removed(f"--omit {name} omits it") for name in COMPONENTS},
+    "keep_checkpoints": Removed("the two newest are kept"),
+    "masks": Removed("--damage-masks is for that"),
+    **{f"masks.{kind}": Removed(f"--damage-masks {kind}:{size} is for that") for kind, size in DAMAGE.items()},
     "static_appearance": Removed("--frozen says what stage II keeps"),
     "static_geometry": Removed("--frozen says what stage II keeps"),
-    "keep_checkpoints": Removed("the two newest are kept"),
-    "masks": Removed(),
-    **{f"masks.{kind}": Removed(f"it is --damage-masks {kind}:{size} now") for kind, size in DAMAGE.items()},
     "try_masks": Removed("--assume auto tries masks out, --assume masks does not"),
     "vrig_factor": Removed("--factor is for these captures, too"),
-    **{name: Removed(f"--omit {name} omits it") for name in COMPONENTS},
+    "densify.dense_fraction": _sizes(2.0, 0.01),
     "densify.depth_gradients": Removed(),
-    "densify.dense_fraction": Removed(SIZES, lambda value, densify: value == 0.01),
-    "densify.max_size": Removed(SIZES, lambda value, densify: value == (20.0 if in_pixels(densify) else 0.1)),
+    "densify.max_size": _sizes(20.0, 0.1),
     "densify.min_opacity": _always(0.005),
-    "densify.split_size": Removed(SIZES, lambda value, densify: value == (2.0 if in_pixels(densify) else 0.01)),
     "densify.noise": Removed("there is no strategy mcmc any more"),
-    "loss.opacity": Removed("there is no such term any more", lambda value, section: value == 0.0),
-    "loss.scale": Removed("there is no such term any more", lambda value, section: value == 0.0),
-    "loss.dynamic_background": Removed(),
+    "densify.split_size": _sizes(2.0, 0.01),
     "loss.depth_margin": Removed(
         "it is 3 with loss.depth_tolerance, else 0",
         lambda value, loss: value == (3.0 if loss.get("depth_tolerance") else 0.0),
@@ -71,18 +68,21 @@ REMOVED: dict[str, Removed] = {
         lambda value, loss: value == bool(loss.get("depth_tolerance")),
     ),
     "loss.dynamic": _always(1.0),
+    "loss.dynamic_background": Removed(),
     "loss.joint": _always(1.0),
     "loss.mask_tolerance": Removed(),
+    "loss.opacity": Removed("there is no such term any more", lambda value, section: value == 0.0),
+    "loss.scale": Removed("there is no such term any more", lambda value, section: value == 0.0),
     "loss.static": _always(1.0),
-    "model.appearance_degree": Removed("--model.appearance has it"),
-    "model.appearance_depth": Removed("--model.appearance-size has it"),
-    "model.appearance_opacity": Removed("--model.appearance has it"),
-    "model.appearance_width": Removed("--model.appearance-size has it"),
-    "model.bound_sizes": Removed("--model.start has it"),
-    "model.dynamic_start": Removed("--model.start has it"),
+    "model.appearance_degree": Removed("--model.appearance is for that"),
+    "model.appearance_depth": Removed("--model.appearance-size is for that"),
+    "model.appearance_opacity": Removed("--model.appearance is for that"),
+    "model.appearance_width": Removed("--model.appearance-size is for that"),
+    "model.bound_sizes": Removed("--model.start is for that"),
+    "model.dynamic_start": Removed("--model.start is for that"),
     "model.path_points": Removed(),
     "model.paths": Removed(),
-    "model.point_colors": Removed("--model.start has it"),
+    "model.point_colors": Removed("--model.start is for that"),
     "optim.means_scale": Removed("--optim.means is in view sizes, with --densify.unit extent in scene units"),
     "optim.opacities": _always(0.05),
     "optim.quats": _always(1e-3),
@@ -254,10 +254,10 @@ def _appearance(values: dict[str, Any]) -> None:
 
 def _means(values: dict[str, Any]) -> None:
     """The rate of positions had a factor of its own, and was in extents of the cameras in version 0.3."""
-    if isinstance(optim := values.get("optim"), dict):
+    if isinstance(optim := values.get("optim"), dict) and "means_in_views" not in values:
         means, factor = optim.get("means"), optim.get("means_scale")
-        values.setdefault("means_in_views", factor is None)
-        if isinstance(means, float) and isinstance(factor, float):
+        values["means_in_views"] = factor is None
+        if isinstance(means, int | float) and isinstance(factor, int | float):
             optim["means"] = means * factor
 
 

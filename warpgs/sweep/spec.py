@@ -185,7 +185,9 @@ def check_options(where: str, options: Any, cls: type = TrainConfig, prefix: str
     known = {field.name: field for field in fields(cls)}
     for name, value in options.items():
         if name not in known:
-            close = suggestion(name, known, f"{prefix}{{}}".format)
+            from warpgs.runs.former import former_option  # imports torch, which the list of sweeps does not need
+
+            close = former_option(f"{prefix}{name}") or suggestion(name, known, f"{prefix}{{}}".format)
             raise ValueError(f"{where}: there is no option {prefix}{name:.60}{close}")
         if not prefix and name in RESERVED:
             raise ValueError(f"{where}: {name} is not an option of one training: the sweep sets it")
