@@ -16,7 +16,7 @@ ORDER = [
     "kernels",
     "runtime",
     "ops",
-    "cameras least_squares",
+    "distortion cameras least_squares",
     "model",
     "rendering",
     "visualize",

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from .cameras import Camera
     from .captures.opening import load_capture
     from .config import RenderSettings
+    from .distortion import Distortion
     from .model.splats import Splats
     from .rendering import render
     from .runs.progress import Progress
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Camera",
+    "Distortion",
     "Progress",
     "RenderSettings",
     "Splats",
@@ -45,6 +47,7 @@ __all__ = [
 
 _HOMES = {
     "Camera": "cameras",
+    "Distortion": "distortion",
     "Progress": "runs.progress",
     "RenderSettings": "config",
     "Splats": "model.splats",

@@ -1,4 +1,4 @@
-"""Pinhole cameras."""
+"""Cameras: pinholes, or with the distortion of a lens."""
 
 import dataclasses
 import math
@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int64, Shaped
 from torch import Tensor
 
+from .distortion import Distortion
 from .runtime.checks import as_number, as_whole_number, check_image_size, check_same_device, check_tensor, one_line_repr
 
 Point = Shaped[Tensor, "3"] | Shaped[np.ndarray, "3"] | Sequence[float]
@@ -29,7 +30,7 @@ def intrinsic_matrix(focal: tuple[float, float], center: tuple[float, float]) ->
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera at one time.
+    """A camera at one time.
 
     Attributes:
         viewmat: [4, 4] rigid world-to-camera transform, OpenCV axes (x right, y down, z forward).
@@ -37,6 +38,7 @@ class Camera:
         width: Width of the image [px].
         height: Height of the image [px].
         time: Time in [0, 1].
+        distortion: Of its lens; None for a pinhole.
 
     Raises:
         ValueError: On a wrong shape, dtype, device or size, or a time that is not a number.
@@ -47,11 +49,13 @@ class Camera:
     width: int
     height: int
     time: float = 0.0
+    distortion: Distortion | None = None
 
     def __post_init__(self) -> None:
         check_tensor("viewmat", self.viewmat, (4, 4), {})
         check_tensor("K", self.K, (3, 3), {})
-        check_same_device({"viewmat": self.viewmat, "K": self.K})
+        coefficients = None if self.distortion is None else self.distortion.coefficients
+        check_same_device({"viewmat": self.viewmat, "K": self.K, "distortion": coefficients})
         object.__setattr__(self, "width", as_whole_number(self.width))
         object.__setattr__(self, "height", as_whole_number(self.height))
         check_image_size(self.width, self.height)
@@ -69,7 +73,8 @@ class Camera:
 
     def to(self, device: torch.device | str) -> "Camera":
         """A copy on another device."""
-        return dataclasses.replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
+        distortion = None if self.distortion is None else self.distortion.to(device)
+        return dataclasses.replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device), distortion=distortion)
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same view as an image of another size."""
@@ -82,7 +87,12 @@ class Camera:
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def depths(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """Depth of points of the world along the optical axis [scene units], negative behind the camera."""
+        """Depth of points of the world along the optical axis [scene units], negative behind the camera.
+
+        With a fisheye lens, which may see what is behind the camera, it is their distance from it.
+        """
+        if self.distortion is not None and self.distortion.measures_distance:
+            return (points - self.position).norm(dim=1)
         return points @ self.viewmat[2, :3] + self.viewmat[2, 3]
 
     def project(
@@ -91,22 +101,27 @@ class Camera:
         """Projects points of the world to pixels.
 
         Returns:
-            Row and column of the pixel of each point, clamped to the image; its depth [scene units]; and whether it is
-            in front of the camera and inside the image.
+            Row and column of the pixel of each point, clamped to the image; its ``depths`` [scene units]; and whether
+            the lens sees it and it is inside the image.
         """
         viewed = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        depth = viewed[:, 2]
-        pixels = (viewed @ self.K.T)[:, :2] / depth[:, None].clamp_min(1e-6)
-        x, y = pixels.floor().unbind(1)
-        is_visible = (depth > 1e-6) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        depth = self.depths(points)
+        if self.distortion is None:
+            pixels, is_seen = (viewed @ self.K.T)[:, :2] / depth[:, None].clamp_min(1e-6), depth > 1e-6
+        else:
+            pixels = self.distortion.bend(viewed) * self.K.diagonal()[:2] + self.K[:2, 2]
+            is_seen = (depth > 1e-6) & self.distortion.sees(viewed)
+        x, y = pixels.nan_to_num(-1.0).floor().unbind(1)
+        is_visible = is_seen & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
         return y.clamp(0, self.height - 1).long(), x.clamp(0, self.width - 1).long(), depth, is_visible
 
     def unproject(
         self, row: Int64[Tensor, " P"], column: Int64[Tensor, " P"], depth: Float[Tensor, " P"]
     ) -> Float[Tensor, "P 3"]:
-        """[P, 3] points of the world at the centres of pixels, at a depth [scene units]."""
+        """[P, 3] points of the world at the centres of pixels, at a depth as of ``depths`` [scene units]."""
         pixels = torch.stack([column.to(depth) + 0.5, row.to(depth) + 0.5, torch.ones_like(depth)], 1)
-        viewed = (pixels @ torch.linalg.inv(self.K).T) * depth[:, None]
+        rays = pixels @ torch.linalg.inv(self.K).T
+        viewed = (rays if self.distortion is None else self.distortion.rays(rays[:, :2])) * depth[:, None]
         return (viewed - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
 
     @staticmethod

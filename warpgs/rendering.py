@@ -74,6 +74,7 @@ class _Request(NamedTuple):
     """Everything but tensors that a render depends on."""
 
     size: tuple[int, int]
+    lens: tuple[float, str]
     settings: RenderSettings
     num_features: int
     sh_degree: int | None
@@ -89,6 +90,7 @@ class _Inputs(NamedTuple):
     appearance: Any
     viewmat: Any
     K: Any
+    distortion: Any
     background: Any
     screen_offsets: Any
     branch: Any
@@ -106,6 +108,7 @@ class _Saved(NamedTuple):
     opacities: Tensor
     viewmat: Tensor
     K: Tensor
+    distortion: Tensor | None
     background: Tensor | None
     sh: Any
     colors: Any
@@ -154,7 +157,7 @@ def render(
 def opacities_on_screen(splats: Splats, camera: Camera, settings: RenderSettings = DEFAULTS) -> Float[Tensor, " N"]:
     """[N] opacities with which ``render`` composites splats: with ``antialias`` compensated, of culled ones 0."""
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
-    view = View(camera.viewmat, camera.K, *camera.size)
+    view = View(camera.viewmat, camera.K, *camera.size, _coefficients(camera), *_lens(camera))
     rows, *_ = project_fwd(geometry, splats.means, view, settings.near, settings.antialias, with_depth=False)
     return rows.opacities
 
@@ -163,7 +166,16 @@ def _request(splats: Splats, camera: Camera, settings: RenderSettings) -> _Reque
     degree = None
     if splats.sh is not None:
         degree = degree_of(splats.sh.shape[1]) if splats.sh_degree is None else splats.sh_degree
-    return _Request(camera.size, settings, splats.num_channels, degree)
+    return _Request(camera.size, _lens(camera), settings, splats.num_channels, degree)
+
+
+def _lens(camera: Camera) -> tuple[float, str]:
+    """``View.limit`` and ``View.lens``."""
+    return (0.0, "pinhole") if camera.distortion is None else (camera.distortion.limit, camera.distortion.lens)
+
+
+def _coefficients(camera: Camera) -> Tensor | None:
+    return None if camera.distortion is None else camera.distortion.coefficients
 
 
 def _inputs(
@@ -172,7 +184,8 @@ def _inputs(
     geometry = splats.means, splats.quats, splats.scales, splats.opacities
     appearance = splats.colors if splats.sh is None else splats.sh
     branch = splats.is_dynamic.view(torch.uint8) if settings.branches and splats.is_dynamic is not None else None
-    return _Inputs(*geometry, appearance, camera.viewmat, camera.K, background, screen_offsets, branch)
+    view = camera.viewmat, camera.K, _coefficients(camera)
+    return _Inputs(*geometry, appearance, *view, background, screen_offsets, branch)
 
 
 def _rendering(outputs: tuple[Tensor, ...], settings: RenderSettings) -> Rendering:
@@ -210,8 +223,8 @@ def _check_inputs(
 
 def _forward(request: _Request, *tensors: Any) -> Recorded:
     """(color →) project → bin → composite; every differentiable step records its backward function on one tape."""
-    inputs, (size, settings, _, sh_degree) = _Inputs._make(tensors), request
-    geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *size)
+    inputs, (size, lens, settings, _, sh_degree) = _Inputs._make(tensors), request
+    geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *size, inputs.distortion, *lens)
     back, tape = _Backward(request, _has_gradient(inputs.screen_offsets)), Tape()
 
     features, sh, colors = inputs.appearance, None, None
@@ -229,7 +242,7 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     tape.record_func(back.composite, [])
 
     alphas = composite.alphas if _has_gradient(inputs.background) else ()
-    saved = _Saved(*geometry, inputs.viewmat, inputs.K, inputs.background, sh, colors, rows.packed)
+    saved = _Saved(*geometry, *inputs[5:8], inputs.background, sh, colors, rows.packed)
     num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
     return Recorded(
         outputs=composite.layers,
@@ -283,11 +296,13 @@ class _Backward:
 
     def project(self) -> None:
         saved, v = self.saved, self.v
-        geometry, view = Geometry(*saved[:4]), View(saved.viewmat, saved.K, *self.request.size)
+        size, lens = self.request.size, self.request.lens
+        geometry, view = Geometry(*saved[:4]), View(saved.viewmat, saved.K, *size, saved.distortion, *lens)
         inputs = (geometry, view, self.request.settings.antialias, self._rows())
         splats = project_bwd(*inputs, v["rows"], self.with_offsets, self.absgrad)
         v |= splats.geometry._asdict()
         v["appearance"], v["viewmat"], v["K"] = splats.features, splats.viewmat, splats.K
+        v["distortion"] = splats.distortion
         v["screen_offsets"] = splats.screen_offsets
 
     def color(self) -> None:

@@ -129,10 +129,10 @@ def project_bwd(
     return SplatGradients(v_geometry, v_features, v_viewmat, v_K, v_offsets, v_distortion)
 
 
-def _sum_over_gaussians(view: View, v_cameras: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sum_over_gaussians(view: View, v_cameras: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """Gradients of ``viewmat``, ``K`` and ``distortion`` from what each Gaussian contributes."""
     sums = v_cameras.sum(0)
     v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)  # their last rows are constant
     v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
     v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:16].unbind()
-    return v_viewmat, v_K, sums[16:]
+    return v_viewmat, v_K, None if view.distortion is None else sums[16:]

@@ -138,12 +138,12 @@ class TrainedScene:
     def play(self, camera: Camera) -> Float[Tensor, "H W 3"]:
         """The joint image at the camera's time, as fast as possible.
 
-        On CUDA the frame is captured in a CUDA graph and replayed for every camera of the same size; the image is then
-        the same tensor in every call, with new values. Raises as ``render``.
+        On CUDA the frame is captured in a CUDA graph and replayed for every pinhole camera of the same size; the image
+        is then the same tensor in every call, with new values. Raises as ``render``.
         """
-        if not self.uses_graphs:
-            return self.render(camera).joint.image
         require_camera(camera)
+        if not self.uses_graphs or camera.distortion is not None:
+            return self.render(camera).joint.image
         require_time(camera.time)
         if self._inputs is None:
             self._inputs = _Inputs(camera.viewmat.clone(), camera.K.clone(), camera.viewmat.new_zeros(1))

@@ -1,0 +1,117 @@
+"""Cameras with the distortion of a lens: points, rays, rendering, and lenses that cannot be used."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from tests.scenes import make_camera, make_splats, relative_error, select
+from warpgs import Camera, render
+from warpgs.distortion import Distortion
+from warpgs.rendering import RenderSettings
+
+K = torch.tensor([[40.0, 0.0, 26.0], [0.0, 42.0, 18.0], [0.0, 0.0, 1.0]])
+SIZE = (50, 37)
+RADIAL = [-0.2, 0.05, 0.01, -0.005, 0.01, 0.02, 0.01, 0.002, 0.003, 0.001, -0.002, 0.001]
+FISHEYE = [0.05, -0.02, 0.01, -0.004]
+LENSES = {"radial": Distortion.radial(RADIAL, K, SIZE), "fisheye": Distortion.fisheye(FISHEYE, K, SIZE)}
+
+
+def camera(lens):
+    turned = make_camera()
+    return dataclasses.replace(turned, K=K, width=SIZE[0], height=SIZE[1], distortion=LENSES[lens])
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_rays_are_bent_to_where_they_come_from(lens):
+    rows, columns = torch.meshgrid(torch.arange(37), torch.arange(50), indexing="ij")
+    depth = torch.linspace(1.0, 5.0, 37 * 50)
+    points = camera(lens).unproject(rows.flatten(), columns.flatten(), depth)
+    row, column, found, is_visible = camera(lens).project(points)
+    assert is_visible.all()
+    assert torch.equal(row, rows.flatten())
+    assert torch.equal(column, columns.flatten())
+    assert relative_error(found, depth) < 1e-5
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_gaussian_appears_at_the_pixel_that_its_centre_is_projected_to(lens):
+    view = camera(lens)
+    for row, column in ((5, 7), (30, 44), (18, 26)):
+        point = view.unproject(torch.tensor([row]), torch.tensor([column]), torch.tensor([3.0]))
+        splats = dataclasses.replace(make_splats(1), means=point, scales=torch.full((1, 3), 1e-3))
+        splats = dataclasses.replace(splats, opacities=torch.tensor([0.9]))
+        rendered = render(splats, view, settings=RenderSettings(depth=True)).joint
+        assert divmod(int(rendered.alpha.argmax()), SIZE[0]) == (row, column)
+        assert rendered.depth[row, column] == pytest.approx(3.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_coefficient_of_a_lens_is_found_from_its_image(lens):
+    splats, view = make_splats(60), camera(lens)
+    truth = torch.tensor(-0.15 if lens == "radial" else 0.1)
+
+    def image(first):
+        coefficients = torch.cat([first[None], torch.zeros(len(view.distortion.coefficients) - 1)])
+        distortion = dataclasses.replace(view.distortion, coefficients=coefficients)
+        return render(splats, dataclasses.replace(view, distortion=distortion)).joint.image
+
+    first, target = torch.zeros((), requires_grad=True), image(truth)
+    optimizer = torch.optim.Adam([first], lr=0.01)
+    for _ in range(60):
+        optimizer.zero_grad()
+        (image(first) - target).square().mean().backward()
+        optimizer.step()
+    assert first.item() == pytest.approx(truth.item(), abs=0.01)
+
+
+def test_without_coefficients_a_radial_lens_renders_as_a_pinhole():
+    pinhole = make_camera()
+    radial = dataclasses.replace(pinhole, distortion=Distortion.radial([], pinhole.K, pinhole.size))
+    splats = make_splats(60)
+    inside = pinhole.project(splats.means)[3]  # Jacobians are clamped by other rules outside
+    assert inside.sum() > 10
+    splats = select(splats, inside)
+    torch.testing.assert_close(render(splats, radial).joint.image, render(splats, pinhole).joint.image)
+
+
+def test_a_fisheye_camera_renders_what_is_beside_and_behind_it():
+    wide = torch.tensor([[9.0, 0.0, 25.5], [0.0, 9.0, 25.5], [0.0, 0.0, 1.0]])
+    view = Camera(torch.eye(4), wide, 50, 50, distortion=Distortion.fisheye([], wide, (50, 50)))
+    for degrees in (0.0, 60.0, 90.0, 130.0):
+        angle = math.radians(degrees)
+        point = 2.0 * torch.tensor([[math.sin(angle), 0.0, math.cos(angle)]])
+        splats = dataclasses.replace(make_splats(1), means=point, scales=torch.full((1, 3), 0.05))
+        image = render(dataclasses.replace(splats, opacities=torch.tensor([0.9])), view).joint.alpha
+        assert int(image.max(0).values.argmax()) == int(25.5 + 9.0 * angle)
+        assert view.depths(point).item() == pytest.approx(2.0)
+        assert bool(view.project(point)[3])
+
+
+@pytest.mark.parametrize(
+    ("make", "coefficients", "message"),
+    [
+        (Distortion.radial, [-0.9], "folds back inside the image: it bends nothing farther than 0.406 focal lengths"),
+        (Distortion.fisheye, [-0.9], "folds back inside the image: it bends nothing farther than 0.406 focal lengths"),
+        (Distortion.radial, [math.nan], "at most 12 finite coefficients"),
+        (Distortion.fisheye, [0.1] * 5, "at most 4 finite coefficients"),
+    ],
+)
+def test_lenses_that_cannot_be_used_are_refused(make, coefficients, message):
+    with pytest.raises(ValueError, match=message):
+        make(coefficients, K, SIZE)
+
+
+def test_a_lens_that_turns_outside_the_image_holds_up_to_there():
+    lens = Distortion.radial([-0.2], K, SIZE)  # r - 0.2 r³ turns at 1.291
+    corner = math.hypot(26.0 / 40.0, 19.0 / 42.0)
+    assert corner < lens.limit < 1.291
+    assert Distortion.fisheye([-0.1], K, SIZE).limit == pytest.approx(math.sqrt(1.0 / 0.3), rel=1e-3)
+
+
+def test_the_camera_and_its_distortion_move_to_a_device_together():
+    moved = camera("radial").to("cpu")
+    assert torch.equal(moved.distortion.coefficients, LENSES["radial"].coefficients)
+    with pytest.raises(ValueError, match="distortion"):
+        dataclasses.replace(camera("radial"), distortion=LENSES["radial"].to("meta"))
