@@ -16,6 +16,7 @@ from torch.distributed import TCPStore
 
 from warpgs.config import TrainConfig
 from warpgs.files import write_json
+from warpgs.runs import checkpoint
 from warpgs.runs.checkpoint import _hash
 from warpgs.runtime import ranks
 from warpgs.training import command, mask_trial
@@ -106,6 +107,7 @@ def train(folder: Path, config: TrainConfig, stop_at: int | None = None, bad_at:
             self._sums.fill_(torch.nan)
 
     Step.__call__ = step
+    checkpoint.NUM_KEPT = 100  # one of them is continued by a single process
     script.evaluate_run = lambda *_, **__: "evaluated"
     make_trainer, trainers = script.make_trainer, []
     script.make_trainer = lambda *arguments: trainers.append(make_trainer(*arguments)) or trainers[0]
