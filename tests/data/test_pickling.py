@@ -59,7 +59,7 @@ def test_a_capture_with_lens_distortion_is_pickled_with_its_frames_as_they_were_
     root = captures.write_capture(tmp_path / "source", "hypernerf")
     for path in (root / "camera").iterdir():
         captures.edit_json(path, radial_distortion=[0.05, 0.0, 0.0])
-    capture = load_with(root, None, LoadOptions(), None)
+    capture = load_with(root, None, LoadOptions())
     copy = pickle.loads(pickle.dumps(capture))
     name = capture.train[0]
     assert torch.equal(copy.read_taken(name).positions, capture.read_taken(name).positions)
