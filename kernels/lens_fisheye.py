@@ -17,8 +17,6 @@ import warp as wp
 
 from .lens import Distortion, mat23
 
-NUM_COEFFICIENTS = 4
-
 SERIES = wp.constant(0.0025)
 """r² below which the series are used. Their next terms are 1e-10 for g, 1e-8 for h and 1e-5 for the derivative of h,
 which counts r² as much."""

@@ -8,8 +8,6 @@ import warp as wp
 from .constants import FIELD_OF_VIEW_MARGIN
 from .lens import Distortion, mat23
 
-NUM_COEFFICIENTS = 0
-
 
 @wp.func
 def clamped_slope(slope: float, size: float, focal: float, center: float) -> float:

@@ -17,8 +17,6 @@ import warp as wp
 
 from .lens import Distortion, mat23
 
-NUM_COEFFICIENTS = 12
-
 
 @wp.func
 def radial_point(t: wp.vec3, focal: wp.vec2, center: wp.vec2, size: wp.vec2, distortion: Distortion, limit: float):

@@ -4,10 +4,8 @@ from typing import NamedTuple
 
 import warp as wp
 
-from .lens_fisheye import NUM_COEFFICIENTS as NUM_FISHEYE
 from .lens_fisheye import fisheye_point
 from .lens_pinhole import pinhole_point
-from .lens_radial import NUM_COEFFICIENTS as NUM_RADIAL
 from .lens_radial import radial_point
 
 
@@ -16,19 +14,17 @@ class LensKernels(NamedTuple):
 
     Attributes:
         point: From a point in camera space to its point in the image and the Jacobian.
-        num_coefficients: Number of coefficients of its distortion.
         is_wide: Whether it may see what is behind the plane z = 0: then points are culled by their distance and their
             angle from the axis instead of by z, and the depth of a splat is its distance.
     """
 
     point: wp.Function
-    num_coefficients: int = 0
     is_wide: bool = False
 
 
 LENSES = {
     "pinhole": LensKernels(pinhole_point),
-    "radial": LensKernels(radial_point, NUM_RADIAL),
-    "fisheye": LensKernels(fisheye_point, NUM_FISHEYE, is_wide=True),
+    "radial": LensKernels(radial_point),
+    "fisheye": LensKernels(fisheye_point, is_wide=True),
 }
 """Lenses by name."""
