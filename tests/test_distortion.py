@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +16,22 @@ K = torch.tensor([[40.0, 0.0, 26.0], [0.0, 42.0, 18.0], [0.0, 0.0, 1.0]])
 SIZE = (50, 37)
 RADIAL = [-0.2, 0.05, 0.01, -0.005, 0.01, 0.02, 0.01, 0.002, 0.003, 0.001, -0.002, 0.001]
 FISHEYE = [0.05, -0.02, 0.01, -0.004]
+CAPTURED = {  # focal lengths, principal point, size and coefficients
+    "phone": ("radial", (3000, 3000), (2016, 1512), (4032, 3024), [0.05, -0.15, 0.001, 0.0005, 0.12]),
+    "depth camera": (
+        "radial",
+        (605, 605),
+        (638, 366),
+        (1280, 720),
+        [0.46, -2.5, 7e-4, -3e-4, 1.5, 0.34, -2.4, 1.4],
+    ),
+    "wide": ("radial", (600, 600), (640, 480), (1280, 960), [-0.35, 0.12]),
+    "pincushion": ("radial", (400, 400), (400, 300), (800, 600), [1.0]),
+    "tangential": ("radial", (400, 400), (400, 300), (800, 600), [0.1, 0.0, 0.03, -0.02]),
+    "off centre": ("radial", (900, 700), (100, 900), (1920, 1080), [-0.1, 0.02]),
+    "one pixel": ("radial", (1, 1), (0.5, 0.5), (1, 1), [-0.1]),
+    "200 degrees": ("fisheye", (440, 440), (640, 480), (1280, 960), [-0.01, 0.002, -0.002, 3e-4]),
+}
 LENSES = {"radial": Distortion.radial(RADIAL, K, SIZE), "fisheye": Distortion.fisheye(FISHEYE, K, SIZE)}
 
 
@@ -33,6 +50,26 @@ def test_rays_are_bent_to_where_they_come_from(lens):
     assert torch.equal(row, rows.flatten())
     assert torch.equal(column, columns.flatten())
     assert relative_error(found, depth) < 1e-5
+
+
+@pytest.mark.parametrize("name", CAPTURED)
+def test_rays_of_real_lenses_are_bent_to_where_they_come_from(name):
+    lens, (fx, fy), (cx, cy), size, coefficients = CAPTURED[name]
+    intrinsics = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    distortion = getattr(Distortion, lens)(coefficients, intrinsics, size)
+    across = torch.cartesian_prod(torch.linspace(0.0, size[0], 40), torch.linspace(0.0, size[1], 40))
+    pixels = distortion.bend(distortion.rays((across - intrinsics[:2, 2]) / intrinsics.diagonal()[:2]))
+    pixels = pixels * intrinsics.diagonal()[:2] + intrinsics[:2, 2]
+    assert (pixels - across).norm(dim=1).max() < 1e-3 * max(1.0, max(size) / 1000.0)
+
+
+def test_pixels_outside_the_circle_of_a_fisheye_lens_show_no_point():
+    wide = torch.tensor([[6.0, 0.0, 25.0], [0.0, 6.0, 25.0], [0.0, 0.0, 1.0]])
+    view = Camera(torch.eye(4), wide, 50, 50, distortion=Distortion.fisheye([], wide, (50, 50)))
+    pixel = torch.tensor([2, 12]), torch.tensor([2, 12])
+    points = view.unproject(*pixel, torch.ones(2))
+    assert points.isnan().all(1).tolist() == [True, False]
+    assert view.project(points)[3].tolist() == [False, True]
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -93,6 +130,7 @@ def test_a_fisheye_camera_renders_what_is_beside_and_behind_it():
     ("make", "coefficients", "message"),
     [
         (Distortion.radial, [-0.9], "folds back inside the image: it bends nothing farther than 0.406 focal lengths"),
+        (Distortion.radial, [0.0, 0.0, 0.5], r"folds back inside the image: it bends nothing to \(0, 0\) px"),
         (Distortion.fisheye, [-0.9], "folds back inside the image: it bends nothing farther than 0.406 focal lengths"),
         (Distortion.radial, [math.nan], "at most 12 finite coefficients"),
         (Distortion.fisheye, [0.1] * 5, "at most 4 finite coefficients"),
@@ -110,8 +148,55 @@ def test_a_lens_that_turns_outside_the_image_holds_up_to_there():
     assert Distortion.fisheye([-0.1], K, SIZE).limit == pytest.approx(math.sqrt(1.0 / 0.3), rel=1e-3)
 
 
-def test_the_camera_and_its_distortion_move_to_a_device_together():
-    moved = camera("radial").to("cpu")
-    assert torch.equal(moved.distortion.coefficients, LENSES["radial"].coefficients)
+@pytest.mark.usefixtures("contracts_off")
+@pytest.mark.parametrize(
+    ("lens", "coefficients", "limit", "message"),
+    [
+        ("fish", torch.zeros(4), 1.0, "lens must be radial or fisheye, got 'fish'"),
+        ("radial", torch.zeros(5), 1.0, r"coefficients must have shape \[12\]"),
+        ("fisheye", torch.zeros(13), 1.0, r"coefficients must have shape \[4\]"),
+        ("radial", torch.zeros(12, dtype=torch.float64), 1.0, "coefficients must be torch.float32"),
+        ("radial", torch.zeros(12), math.nan, "limit must be positive and finite"),
+        ("radial", torch.zeros(12), math.inf, "limit must be positive and finite"),
+        ("fisheye", torch.zeros(4), math.pi, "of a fisheye at most 3.107"),
+    ],
+)
+def test_coefficients_and_limits_that_do_not_fit_the_lens_are_refused(lens, coefficients, limit, message):
+    with pytest.raises(ValueError, match=message):
+        Distortion(lens, coefficients, limit)
+
+
+@pytest.mark.usefixtures("contracts_off")
+def test_a_camera_refuses_coefficients_without_their_lens():
+    with pytest.raises(ValueError, match="distortion must be a Distortion or None, got list"):
+        Camera(torch.eye(4), K, *SIZE, 0.0, RADIAL)
+
+
+@pytest.mark.parametrize("shape", [(1, 5), (5, 1), (5,)])
+def test_coefficients_may_be_the_array_that_opencv_returns(shape):
+    array = np.array(RADIAL[:5]).reshape(shape)
+    expected = Distortion.radial(RADIAL[:5], K, SIZE)
+    assert torch.equal(Distortion.radial(array, K, SIZE).coefficients, expected.coefficients)
+
+
+def test_coefficients_of_a_tensor_keep_their_gradient():
+    coefficients = torch.tensor(FISHEYE, requires_grad=True)
+    view = dataclasses.replace(camera("fisheye"), distortion=Distortion.fisheye(coefficients, K, SIZE))
+    render(make_splats(60), view).joint.image.sum().backward()
+    assert (coefficients.grad != 0.0).all()
+
+
+def test_coefficients_that_are_not_numbers_render_nothing():
+    lens = dataclasses.replace(LENSES["radial"], coefficients=torch.full((12,), math.nan))
+    assert not render(make_splats(60), dataclasses.replace(camera("radial"), distortion=lens)).joint.alpha.any()
+
+
+def test_the_camera_moves_its_distortion_to_the_device(monkeypatch):
+    moved = dataclasses.replace(LENSES["radial"])
+    monkeypatch.setattr(Distortion, "to", lambda distortion, device: moved)
+    assert camera("radial").to("cpu").distortion is moved
+
+
+def test_a_camera_and_its_distortion_are_on_one_device():
     with pytest.raises(ValueError, match="distortion"):
         dataclasses.replace(camera("radial"), distortion=LENSES["radial"].to("meta"))

@@ -54,6 +54,8 @@ class Camera:
     def __post_init__(self) -> None:
         check_tensor("viewmat", self.viewmat, (4, 4), {})
         check_tensor("K", self.K, (3, 3), {})
+        if not isinstance(self.distortion, Distortion | None):
+            raise ValueError(f"distortion must be a Distortion or None, got {type(self.distortion).__name__}")
         coefficients = None if self.distortion is None else self.distortion.coefficients
         check_same_device({"viewmat": self.viewmat, "K": self.K, "distortion": coefficients})
         object.__setattr__(self, "width", as_whole_number(self.width))
@@ -118,7 +120,10 @@ class Camera:
     def unproject(
         self, row: Int64[Tensor, " P"], column: Int64[Tensor, " P"], depth: Float[Tensor, " P"]
     ) -> Float[Tensor, "P 3"]:
-        """[P, 3] points of the world at the centres of pixels, at a depth as of ``depths`` [scene units]."""
+        """[P, 3] points of the world at the centres of pixels, at a depth as of ``depths`` [scene units].
+
+        They are NaN at pixels that show nothing: the corners of a fisheye lens' circular image.
+        """
         pixels = torch.stack([column.to(depth) + 0.5, row.to(depth) + 0.5, torch.ones_like(depth)], 1)
         rays = pixels @ torch.linalg.inv(self.K).T
         viewed = (rays if self.distortion is None else self.distortion.rays(rays[:, :2])) * depth[:, None]

@@ -2,18 +2,27 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-NUM_RADIAL, NUM_FISHEYE = 12, 4
+from .runtime.checks import as_number, check_image_size, check_tensor, one_line_repr
+
+Coefficients = Sequence[float] | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
+"""Coefficients of a lens, also as OpenCV returns them: [1, C] or [C, 1]."""
+
+NUM_COEFFICIENTS = {"radial": 12, "fisheye": 4}
 
 MARGIN = 1.3
 """How far beyond the image's corners a radial lens follows its formula, relative to their distance from the axis."""
+
+RADIAL_TERMS = torch.tensor([1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, *[0.0] * 4])
+"""Which coefficients of a radial lens act along the radius."""
 
 MAX_ZOOM_OUT = 8.0
 """How much farther from the axis than a pinhole camera a radial lens may see [ratio of radii on the plane z = 1]."""
@@ -24,8 +33,20 @@ MAX_ANGLE = math.radians(178.0)
 NUM_SAMPLES = 4_096
 """Radii or angles at which a lens is tested for folding back."""
 
-NUM_STEPS = 40
-"""Steps that invert a lens; real lenses converge to 1e-6 in ten."""
+TINY = 1e-12
+"""Least distance from the axis that something is divided by: on the axis 0 / 0 is then 0."""
+
+NUM_HALVINGS = 24
+"""Steps of the bisection that inverts a lens along its radius."""
+
+NUM_NEWTON_STEPS = 5
+"""Steps from there that invert the tangential and prism terms, too."""
+
+MAX_RESIDUAL = 1e-5
+"""Distance from a position up to which a ray is bent to it [focal lengths]."""
+
+NUM_BORDER_POINTS = 64
+"""Points of each side of the image at which a radial lens is inverted to test it."""
 
 
 @dataclass(frozen=True)
@@ -38,40 +59,62 @@ class Distortion:
         coefficients: [12] or [4].
         limit: How far from the axis the formula holds: the radius on the plane z = 1 beyond which a radial lens
             continues linearly, or the angle beyond which a fisheye lens sees nothing [radians].
+
+    Raises:
+        ValueError: On an unknown lens, a wrong shape or dtype, or a limit that is not positive and finite, or for a
+            fisheye above 178 degrees.
     """
 
     lens: Literal["radial", "fisheye"]
     coefficients: Float[Tensor, " C"]
     limit: float
 
+    def __post_init__(self) -> None:
+        if self.lens not in NUM_COEFFICIENTS:
+            raise ValueError(f"lens must be radial or fisheye, got {one_line_repr(self.lens)}")
+        check_tensor("coefficients", self.coefficients, (NUM_COEFFICIENTS[self.lens],), {})
+        limit = as_number("limit", self.limit)
+        if not 0.0 < limit < math.inf or (self.lens == "fisheye" and limit > MAX_ANGLE):
+            raise ValueError(f"limit must be positive and finite, of a fisheye at most {MAX_ANGLE:.4g}, got {limit}")
+        object.__setattr__(self, "limit", limit)
+
     @staticmethod
-    def radial(coefficients: Sequence[float], K: Float[Tensor, "3 3"], size: tuple[int, int]) -> "Distortion":
+    def radial(coefficients: Coefficients, K: Float[Tensor, "3 3"], size: tuple[int, int]) -> "Distortion":
         """The distortion of a lens with OpenCV's coefficients, on the device of K.
 
         Args:
-            coefficients: Up to 12, in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4.
+            coefficients: Up to 12, in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4; a tensor keeps
+                its gradient.
             K: [3, 3] intrinsics [px].
             size: (width, height) of the image [px].
 
         Raises:
-            ValueError: If a coefficient is not finite, there are too many, or the lens folds back inside the image.
+            ValueError: If a coefficient is not finite, there are too many, K or the size is wrong, or the lens folds
+                back inside the image.
         """
-        k = _tensor(coefficients, NUM_RADIAL, K.device)
+        k = _tensor("radial", coefficients, K)
         reach = _distances(K, size).norm(dim=0).item()
         radii = torch.linspace(0.0, MAX_ZOOM_OUT * reach, NUM_SAMPLES, dtype=torch.float64)
         along = torch.stack([radii, torch.zeros_like(radii)], 1)
-        is_radial = torch.tensor([1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, *[0.0] * 4])
-        ideal = k.double().cpu() * is_radial
+        ideal = k.detach().double().cpu() * RADIAL_TERMS
         at_corner, turns = _checked_profile(radii, _radial(along, ideal)[:, 0], reach, k)
-        return Distortion("radial", k, min(MARGIN * at_corner, turns))
+        lens = Distortion("radial", k, min(MARGIN * at_corner, turns))
+        border = _border(K, size)
+        if not bool((has_ray := lens.rays(border).isfinite().all(1)).all()):
+            x, y = (border[~has_ray][0] * K.diagonal()[:2] + K[:2, 2]).tolist()
+            raise ValueError(
+                f"the lens folds back inside the image: it bends nothing to ({x:.0f}, {y:.0f}) px on the border; its "
+                f"coefficients are {_text(k)}"
+            )
+        return lens
 
     @staticmethod
-    def fisheye(coefficients: Sequence[float], K: Float[Tensor, "3 3"], size: tuple[int, int]) -> "Distortion":
+    def fisheye(coefficients: Coefficients, K: Float[Tensor, "3 3"], size: tuple[int, int]) -> "Distortion":
         """The distortion of a fisheye lens with up to 4 coefficients of cv2.fisheye; arguments as for ``radial``."""
-        k = _tensor(coefficients, NUM_FISHEYE, K.device)
+        k = _tensor("fisheye", coefficients, K)
         reach = _distances(K, size).min().item()  # a circular image leaves the corners black
         theta = torch.linspace(0.0, MAX_ANGLE, NUM_SAMPLES, dtype=torch.float64)
-        _, turns = _checked_profile(theta, _bent_angle(theta, k.double().cpu()), reach, k)
+        _, turns = _checked_profile(theta, _bent_angle(theta, k.detach().double().cpu()), reach, k)
         return Distortion("fisheye", k, turns)
 
     def to(self, device: torch.device | str) -> "Distortion":
@@ -92,37 +135,58 @@ class Distortion:
     def bend(self, viewed: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
         """[P, 2] where the lens puts points in camera space, from the principal point [focal lengths]."""
         if self.lens == "fisheye":
-            rho = viewed[:, :2].norm(dim=1).clamp_min(1e-12)
+            rho = viewed[:, :2].norm(dim=1).clamp_min(TINY)
             bent = _bent_angle(torch.atan2(rho, viewed[:, 2]), self.coefficients.to(viewed))
             return viewed[:, :2] * (bent / rho)[:, None]
         return _radial(viewed[:, :2] / viewed[:, 2:], self.coefficients.to(viewed))
 
+    @torch.no_grad()
     def rays(self, bent: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
-        """[P, 3] rays that the lens bends to positions [focal lengths]: of z = 1, or of a fisheye lens unit vectors."""
-        k = self.coefficients.to(bent)
+        """[P, 3] rays that the lens bends to positions [focal lengths], NaN where it bends none that it sees.
+
+        They have z = 1, or, of a fisheye lens, are unit vectors. Computed in double precision, without gradients.
+        """
+        k, position = self.coefficients.to(bent).double(), bent.double()
         if self.lens == "fisheye":
-            radius = bent.norm(dim=1)
-            theta = _inverse_angle(radius, k, self.limit)
-            across = bent * (theta.sin() / radius.clamp_min(1e-12))[:, None]
-            return torch.cat([across, theta.cos()[:, None]], 1)
-        slopes = bent
-        for _ in range(NUM_STEPS):
-            slopes = slopes + (bent - _radial(slopes, k))
-        return torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1)
+            radius = position.norm(dim=1)
+            theta = _inverse(lambda theta: _bent_angle(theta, k), radius, self.limit)
+            across = position * (theta.sin() / radius.clamp_min(TINY))[:, None]
+            rays = torch.cat([across, theta.cos()[:, None]], 1)
+            is_found = (_bent_angle(theta, k) - radius).abs() < MAX_RESIDUAL
+        else:
+            slopes = _inverse_radial(position, k, self.limit)
+            rays = torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1)
+            is_found = (_radial(slopes, k) - position).norm(dim=1) < MAX_RESIDUAL
+            is_found &= slopes.norm(dim=1) < (1.0 + MAX_RESIDUAL) * self.limit
+        return torch.where(is_found[:, None], rays, math.nan).to(bent)
 
 
-def _tensor(coefficients: Sequence[float], num: int, device: torch.device) -> Float[Tensor, " C"]:
-    """Coefficients with zeros for missing ones."""
-    values = [float(value) for value in coefficients]
-    if len(values) > num or not all(map(math.isfinite, values)):
-        raise ValueError(f"a lens has at most {num} finite coefficients here, got {values}")
-    return torch.tensor(values + [0.0] * (num - len(values)), dtype=torch.float32, device=device)
+def _tensor(lens: str, coefficients: Coefficients, K: Float[Tensor, "3 3"]) -> Float[Tensor, " C"]:
+    """Coefficients with zeros for missing ones, on the device of K."""
+    check_tensor("K", K, (3, 3), {})
+    num, k = NUM_COEFFICIENTS[lens], torch.as_tensor(coefficients, dtype=torch.float32, device=K.device).flatten()
+    if len(k) > num or not bool(k.isfinite().all()):
+        raise ValueError(f"a {lens} lens has at most {num} finite coefficients here, got {k.tolist()}")
+    return torch.nn.functional.pad(k, (0, num - len(k)))
+
+
+def _text(k: Float[Tensor, " C"]) -> str:
+    return ", ".join(f"{value:g}" for value in k.tolist())
 
 
 def _distances(K: Float[Tensor, "3 3"], size: tuple[int, int]) -> Float[Tensor, "2"]:
     """[2] distances of the principal point to the farther vertical and horizontal border [focal lengths]."""
-    center, focal = K[:2, 2].cpu(), K.diagonal()[:2].cpu()
+    check_image_size(*size)
+    center, focal = K[:2, 2].detach().cpu(), K.diagonal()[:2].detach().cpu()
     return torch.maximum(center, torch.tensor(size) - center) / focal
+
+
+def _border(K: Float[Tensor, "3 3"], size: tuple[int, int]) -> Float[Tensor, "B 2"]:
+    """[B, 2] points on the border of the image, from the principal point [focal lengths]."""
+    along = torch.linspace(0.0, 1.0, NUM_BORDER_POINTS)
+    low, high = torch.zeros_like(along), torch.ones_like(along)
+    sides = [torch.stack(side, 1) for side in ((along, low), (along, high), (low, along), (high, along))]
+    return (torch.cat(sides).to(K.device) * torch.tensor(size, device=K.device) - K[:2, 2]) / K.diagonal()[:2]
 
 
 def _checked_profile(
@@ -141,10 +205,9 @@ def _checked_profile(
     """
     num_rising = int((bent.diff() > 0.0).long().cumprod(0).sum())
     if num_rising < len(ideal) - 1 and bent[num_rising] < reach:
-        values = ", ".join(f"{value:g}" for value in k.tolist())
         raise ValueError(
             f"the lens folds back inside the image: it bends nothing farther than {bent[num_rising]:.3g} focal lengths "
-            f"from the axis, and the border is at {reach:.3g}; its coefficients are {values}"
+            f"from the axis, and the border is at {reach:.3g}; its coefficients are {_text(k)}"
         )
     return float(ideal[int((bent[: num_rising + 1] < reach).sum().clamp(max=num_rising))]), float(ideal[num_rising])
 
@@ -164,11 +227,29 @@ def _bent_angle(theta: Float[Tensor, " P"], k: Float[Tensor, "4"]) -> Float[Tens
     return theta * (1.0 + s * (k[0] + s * (k[1] + s * (k[2] + s * k[3]))))
 
 
-def _inverse_angle(bent: Float[Tensor, " P"], k: Float[Tensor, "4"], limit: float) -> Float[Tensor, " P"]:
-    """The angles up to a limit that the lens bends to positions, by bisection: it rises up to there."""
-    low, high = torch.zeros_like(bent), torch.full_like(bent, limit)
-    for _ in range(NUM_STEPS):
+def _inverse(function: Callable[[Tensor], Tensor], values: Float[Tensor, " P"], limit: float) -> Float[Tensor, " P"]:
+    """Where in [0, limit] a function that rises there has each value, or is closest to it, by bisection."""
+    low, high = torch.zeros_like(values), torch.full_like(values, limit)
+    for _ in range(NUM_HALVINGS):
         middle = 0.5 * (low + high)
-        is_below = _bent_angle(middle, k) < bent
+        is_below = function(middle) < values
         low, high = torch.where(is_below, middle, low), torch.where(is_below, high, middle)
     return 0.5 * (low + high)
+
+
+def _inverse_radial(position: Float[Tensor, "P 2"], k: Float[Tensor, "12"], limit: float) -> Float[Tensor, "P 2"]:
+    """Slopes that a radial lens bends to positions, by bisection of its radial terms and then by Newton's method.
+
+    The usual fixed point x + (bent - f(x)) diverges where the lens magnifies, f' > 2, and hardly moves near its limit.
+    """
+    profile, radius = k * RADIAL_TERMS.to(k), position.norm(dim=1)
+    along_x = _inverse(lambda r: _radial(torch.stack([r, torch.zeros_like(r)], 1), profile)[:, 0], radius, limit)
+    slopes = position * (along_x / radius.clamp_min(TINY))[:, None]
+    for _ in range(NUM_NEWTON_STEPS):
+        with torch.enable_grad():
+            residuals = _radial(slopes.requires_grad_(), k) - position
+            rows = [torch.autograd.grad(part.sum(), slopes, retain_graph=True)[0] for part in residuals.unbind(1)]
+        (xx, xy), (yx, yy) = (row.unbind(1) for row in rows)
+        x, y = residuals.detach().unbind(1)
+        slopes = slopes.detach() - torch.stack([yy * x - xy * y, xx * y - yx * x], 1) / (xx * yy - xy * yx)[:, None]
+    return slopes
