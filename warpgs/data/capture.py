@@ -153,7 +153,8 @@ class Capture:
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
 
     Raises:
-        ValueError: If there are no training frames.
+        ValueError: If there are no training frames, or a camera has the distortion of a lens: all that is done with
+            frames takes them as images of pinholes.
     """
 
     name: str
@@ -180,6 +181,8 @@ class Capture:
     def __post_init__(self) -> None:
         if not self.train:
             raise ValueError(f"{self.name} has no frames to train on")
+        if distorted := [name for name, camera in self.cameras.items() if camera.distortion is not None]:
+            raise ValueError(f"{self.name} must have undistorted frames: the camera of {distorted[0]} has a distortion")
         self.train, self.val, self.notes = tuple(self.train), tuple(self.val), tuple(self.notes)
         self.assumption, self.has_empty = self.unmasked, self.background == "white"
         self._moved: frozenset[str] = frozenset()

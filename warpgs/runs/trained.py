@@ -124,8 +124,9 @@ class TrainedScene:
             time: Time in [0, 1]; ``camera.time`` if None.
             branches: Whether to render the static and the dynamic image as well.
             depth: Whether to render depth as well, as ``depth`` [H, W] of each layer: the mean depth of its Gaussians
-                along the camera's z axis, weighted by their contribution [scene units]. Where alpha is 0, it is 0;
-                where alpha is low, it is that of the little that is there.
+                along the camera's z axis, or from a fisheye camera their distance from it, weighted by their
+                contribution [scene units]. Where alpha is 0, it is 0; where alpha is low, it is that of the little that
+                is there.
 
         Raises:
             TypeError: If the camera is something else.
