@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+import pytest
 from scipy.spatial.transform import Rotation
 
 from warpgs.prepare.cameras.features import Job
@@ -108,8 +109,16 @@ def test_frames_of_a_camera_that_comes_nearer_stay():
     assert len(names(continuous(in_two_parts([8, 4, 2, 1, 0.5])))) == 5
 
 
-def test_frames_that_see_no_point_are_removed():
+@pytest.mark.parametrize("blind", [0, 1, 3])
+def test_frames_that_see_no_point_are_removed_without_those_around_them(blind):
     model = in_two_parts([1, 1, 1, 1])
-    for point in [*model.images[4].points2D]:
+    for point in [*model.images[blind + 1].points2D]:
         model.delete_point3D(point.point3D_id)
-    assert names(continuous(model)) == ["00", "01", "02"]
+    assert names(continuous(model)) == [name for k, name in enumerate(("00", "01", "02", "03")) if k != blind]
+
+
+def test_a_reconstruction_without_points_has_no_frames():
+    model = in_two_parts([1, 1])
+    for point in [*model.points3D]:
+        model.delete_point3D(point)
+    assert names(continuous(model)) == []

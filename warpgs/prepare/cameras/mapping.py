@@ -115,8 +115,7 @@ def _map_from(job: Job, database: Path) -> Any:
         models = pycolmap.global_mapping(database, job.folder, _empty(job, "mapping"), options)
     except (RuntimeError, ValueError):  # it raises if it finds no geometry
         return None
-    model = max(models.values(), key=_size, default=None)
-    return None if model is None else continuous(_supported(model))
+    return max((continuous(_supported(model)) for model in models.values()), key=_size, default=None)
 
 
 def _set_adjustment(adjustment: Any, job: Job) -> None:
@@ -138,22 +137,23 @@ def continuous(model: Any) -> Any:
     """The reconstruction without frames that have a scale of their own, of which all but the longest run are removed.
 
     Frames that share few points with those before them, or hardly move, may end anywhere on the rays to these points.
+    Frames that see no point, such as those that are masked as a whole, are removed, too, but do not end a run.
     """
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    placed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    images = [image for image in placed if any(point.has_point3D() for point in image.points2D)]
     depths = np.log([_median_depth(model, image) for image in images])
     is_break = ~(np.abs(np.diff(depths)) <= math.log(MAX_DEPTH_RATIO))
     runs = np.split(np.array(images, object), is_break.nonzero()[0] + 1)
-    longest = max(runs, key=len)
-    for image in (image for run in runs if run is not longest for image in run):
-        model.deregister_frame(image.frame_id)
+    kept = {image.image_id for image in max(runs, key=len)}
+    for image in placed:
+        if image.image_id not in kept:
+            model.deregister_frame(image.frame_id)
     return model
 
 
 def _median_depth(model: Any, image: Any) -> float:
-    """Median depth of the points that a frame sees; NaN if it sees none or most are behind it."""
+    """Median depth of the points that a frame sees; NaN if most are behind it."""
     seen = [model.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
-    if not seen:
-        return math.nan
     pose = image.cam_from_world().matrix()
     depth = float(np.median(np.array(seen) @ pose[2, :3] + pose[2, 3]))
     return depth if depth > 0.0 else math.nan
@@ -170,8 +170,7 @@ def _map_incrementally(job: Job, database: Path, report: Report) -> Any:
     models = pycolmap.incremental_mapping(
         database, job.folder, _empty(job, "mapping"), _pipeline_options(job), next_image_callback=count
     )
-    model = max(models.values(), key=_size, default=None)
-    return None if model is None else continuous(model)
+    return max(map(continuous, models.values()), key=_size, default=None)
 
 
 def refine(job: Job, model: Any, report: Report) -> Any:
