@@ -24,6 +24,7 @@ from tests.scenes import (
 )
 from warpgs.bench.workloads import graphed, make_workload, parameter_names
 from warpgs.config import RenderSettings
+from warpgs.distortion import Distortion
 from warpgs.kernels.constants import CULLED_DEPTH
 from warpgs.ops.depth_error import depth_error
 from warpgs.ops.dropout import dropout
@@ -73,6 +74,20 @@ def test_dropout_omits_the_same_gaussians_as_on_cpu():
 
 def test_five_channels_equal_those_on_cpu():
     for actual, expected in zip(rendered("cuda", SETTINGS[0], 5), rendered("cpu", SETTINGS[0], 5), strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+@pytest.mark.parametrize(("lens", "coefficients"), [("radial", [-0.2, 0.05, 0.01]), ("fisheye", [0.05, -0.02])])
+def test_images_and_gradients_through_a_lens_equal_those_on_cpu(lens, coefficients):
+    def pull(device):
+        splats, view = as_leaves(make_splats(200).to(device)), make_camera().to(device)
+        values = torch.tensor(coefficients, requires_grad=True)
+        distortion = getattr(Distortion, lens)(values, view.K, view.size)
+        image = render(splats, dataclasses.replace(view, distortion=distortion)).joint.image
+        image.square().sum().backward()
+        return [t.detach().cpu() for t in (image, values.grad, *gradients(splats).values())]
+
+    for actual, expected in zip(pull("cuda"), pull("cpu"), strict=True):
         assert relative_error(actual, expected) < 1e-5
 
 

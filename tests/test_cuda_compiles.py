@@ -8,6 +8,7 @@ import warp as wp
 from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.encoding import make_encode
+from warpgs.kernels.lenses import LENSES
 from warpgs.kernels.mlp import make_layer_bwd
 from warpgs.kernels.projection import make_project_bwd, make_project_fwd
 from warpgs.kernels.sort import make_sort_pairs
@@ -49,8 +50,9 @@ def test_the_encoding_compiles(half, tmp_path):
 
 @pytest.mark.parametrize("make", [make_project_fwd, make_project_bwd])
 @pytest.mark.parametrize("with_depth", [False, True])
-def test_the_projection_compiles(make, with_depth, tmp_path):
-    assert_compiles(make(3, with_depth).module, tmp_path)
+@pytest.mark.parametrize("lens", LENSES)
+def test_the_projection_compiles(make, with_depth, lens, tmp_path):
+    assert_compiles(make(3, with_depth, lens).module, tmp_path)
 
 
 @pytest.mark.parametrize("make", [make_ssim_fwd, make_ssim_bwd])

@@ -63,6 +63,17 @@ def test_rays_of_real_lenses_are_bent_to_where_they_come_from(name):
     assert (pixels - across).norm(dim=1).max() < 1e-3 * max(1.0, max(size) / 1000.0)
 
 
+@pytest.mark.parametrize("lens", LENSES)
+def test_an_image_of_another_size_shows_points_at_the_same_places(lens):
+    view = camera(lens)
+    rows, columns = torch.tensor([3, 11, 30]), torch.tensor([4, 25, 45])
+    points = view.unproject(rows, columns, torch.ones(3))
+    row, column, _, is_visible = view.resized(150, 185).project(points)  # 3 times as wide, 5 times as high
+    assert is_visible.all()
+    assert torch.equal(row, 5 * rows + 2)
+    assert torch.equal(column, 3 * columns + 1)
+
+
 def test_pixels_outside_the_circle_of_a_fisheye_lens_show_no_point():
     wide = torch.tensor([[6.0, 0.0, 25.0], [0.0, 6.0, 25.0], [0.0, 0.0, 1.0]])
     view = Camera(torch.eye(4), wide, 50, 50, distortion=Distortion.fisheye([], wide, (50, 50)))

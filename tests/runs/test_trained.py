@@ -11,6 +11,7 @@ import torch
 from tests.export import scenes
 from tests.scenes import shifted
 from warpgs.config import RenderSettings
+from warpgs.distortion import Distortion
 from warpgs.rendering import render
 from warpgs.runs.trained import MAX_GRAPHS, TrainedScene
 from warpgs.runtime import graphs
@@ -55,6 +56,15 @@ def test_one_graph_plays_every_camera_of_a_size(trained, captured):
         camera = shifted(scenes.camera(), 0.1 * k, 0.1 * k)
         assert torch.equal(trained.play(camera), trained.render(camera).joint.image)
     assert captured == [(64, 48)]
+
+
+def test_a_camera_with_distortion_plays_as_it_is_rendered(trained, captured):
+    pinhole = scenes.camera()
+    lens = Distortion.radial([-0.2], pinhole.K, pinhole.size)
+    camera = dataclasses.replace(pinhole, distortion=lens)
+    trained.play(pinhole)
+    assert torch.equal(trained.play(camera), trained.render(camera).joint.image)
+    assert not torch.equal(trained.play(camera), trained.play(pinhole))
 
 
 def test_a_time_of_numpy_is_rendered_like_one_of_python(trained):
