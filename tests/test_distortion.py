@@ -156,7 +156,18 @@ def test_a_lens_that_turns_outside_the_image_holds_up_to_there():
     lens = Distortion.radial([-0.2], K, SIZE)  # r - 0.2 r³ turns at 1.291
     corner = math.hypot(26.0 / 40.0, 19.0 / 42.0)
     assert corner < lens.limit < 1.291
-    assert Distortion.fisheye([-0.1], K, SIZE).limit == pytest.approx(math.sqrt(1.0 / 0.3), rel=1e-3)
+    assert Distortion.fisheye([-0.2], K, SIZE).limit == pytest.approx(math.sqrt(1.0 / 0.6), rel=1e-3)
+
+
+@pytest.mark.parametrize(("focal", "limit"), [(400.0, math.pi / 2), (150.0, 1.3 * 500.0 / 150.0 / 2)])
+def test_a_fisheye_lens_sees_little_more_than_its_image_shows(focal, limit):
+    intrinsics = torch.tensor([[focal, 0.0, 200.0], [0.0, focal, 150.0], [0.0, 0.0, 1.0]])
+    lens = Distortion.fisheye([], intrinsics, (400, 300))
+    assert lens.limit == pytest.approx(limit, rel=1e-3)
+    view = Camera(torch.eye(4), intrinsics, 400, 300, distortion=lens)
+    behind = torch.tensor([[0.1, 0.0, -1.0]])
+    splats = dataclasses.replace(make_splats(1), means=behind, scales=torch.full((1, 3), 0.1))
+    assert not render(splats, view).joint.alpha.any()
 
 
 @pytest.mark.usefixtures("contracts_off")

@@ -19,7 +19,9 @@ Coefficients = Sequence[float] | Shaped[Tensor, "..."] | Shaped[np.ndarray, "...
 NUM_COEFFICIENTS = {"radial": 12, "fisheye": 4}
 
 MARGIN = 1.3
-"""How far beyond the image's corners a radial lens follows its formula, relative to their distance from the axis."""
+"""How far beyond the image's corners a radial lens follows its formula, relative to their distance from the axis, and a
+fisheye lens sees, relative to their angle, but at least to 90 degrees as a pinhole does: splats behind the camera are
+smeared over the image, because their ellipse does not follow the circle around the direction right behind."""
 
 RADIAL_TERMS = torch.tensor([1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, *[0.0] * 4])
 """Which coefficients of a radial lens act along the radius."""
@@ -97,7 +99,7 @@ class Distortion:
         radii = torch.linspace(0.0, MAX_ZOOM_OUT * reach, NUM_SAMPLES, dtype=torch.float64)
         along = torch.stack([radii, torch.zeros_like(radii)], 1)
         ideal = k.detach().double().cpu() * RADIAL_TERMS
-        at_corner, turns = _checked_profile(radii, _radial(along, ideal)[:, 0], reach, k)
+        at_corner, turns = _checked_profile(radii, _radial(along, ideal)[:, 0], reach, k, reach)
         lens = Distortion("radial", k, min(MARGIN * at_corner, turns))
         border = _border(K, size)
         if not bool((has_ray := lens.rays(border).isfinite().all(1)).all()):
@@ -112,10 +114,12 @@ class Distortion:
     def fisheye(coefficients: Coefficients, K: Float[Tensor, "3 3"], size: tuple[int, int]) -> "Distortion":
         """The distortion of a fisheye lens with up to 4 coefficients of cv2.fisheye; arguments as for ``radial``."""
         k = _tensor("fisheye", coefficients, K)
-        reach = _distances(K, size).min().item()  # a circular image leaves the corners black
+        distances = _distances(K, size)
         theta = torch.linspace(0.0, MAX_ANGLE, NUM_SAMPLES, dtype=torch.float64)
-        _, turns = _checked_profile(theta, _bent_angle(theta, k.detach().double().cpu()), reach, k)
-        return Distortion("fisheye", k, turns)
+        bent = _bent_angle(theta, k.detach().double().cpu())
+        # A circular image leaves the corners black.
+        at_corner, turns = _checked_profile(theta, bent, distances.norm().item(), k, distances.min().item())
+        return Distortion("fisheye", k, min(max(MARGIN * at_corner, math.pi / 2), turns))
 
     def to(self, device: torch.device | str) -> "Distortion":
         """A copy on another device."""
@@ -190,15 +194,16 @@ def _border(K: Float[Tensor, "3 3"], size: tuple[int, int]) -> Float[Tensor, "B 
 
 
 def _checked_profile(
-    ideal: Float[Tensor, " S"], bent: Float[Tensor, " S"], reach: float, k: Float[Tensor, " C"]
+    ideal: Float[Tensor, " S"], bent: Float[Tensor, " S"], corner: float, k: Float[Tensor, " C"], reach: float
 ) -> tuple[float, float]:
-    """Where a lens reaches the border of the image, and where it turns, or else the last of the samples.
+    """Where a lens reaches the corner of the image, and where it turns, or else the last of the samples.
 
     Args:
         ideal: [S] increasing radii or angles.
         bent: [S] how far from the axis the lens puts them [focal lengths].
-        reach: Distance of the image's border from the axis [focal lengths].
+        corner: Distance of the image's farthest corner from the axis [focal lengths].
         k: Its coefficients, for the message.
+        reach: Distance of the border that it has to reach [focal lengths].
 
     Raises:
         ValueError: If the lens turns before it reaches the border.
@@ -209,7 +214,7 @@ def _checked_profile(
             f"the lens folds back inside the image: it bends nothing farther than {bent[num_rising]:.3g} focal lengths "
             f"from the axis, and the border is at {reach:.3g}; its coefficients are {_text(k)}"
         )
-    return float(ideal[int((bent[: num_rising + 1] < reach).sum().clamp(max=num_rising))]), float(ideal[num_rising])
+    return float(ideal[int((bent[: num_rising + 1] < corner).sum().clamp(max=num_rising))]), float(ideal[num_rising])
 
 
 def _radial(slopes: Float[Tensor, "P 2"], k: Float[Tensor, "12"]) -> Float[Tensor, "P 2"]:
