@@ -30,7 +30,7 @@ MIN_OBSERVED = 30
 
 MAX_DEPTH_RATIO = 3.0
 """Maximum ratio of the median depths of the points that two consecutive frames see. Of 34 reconstructions of DAVIS's
-clips whose cameras are right it is 1.4 at most, with every sixth frame 1.8; where the scale breaks, 6 to 10⁷."""
+clips whose cameras are right it is 1.4 at most, with every fourth frame 1.8; where the scale breaks, 6 to 10⁷."""
 
 MIN_PARALLEL = 1_000
 """Number of residuals from which on bundle adjustment uses all cores; COLMAP's 50,000 leave most videos to one."""
