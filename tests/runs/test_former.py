@@ -9,23 +9,12 @@ import torch
 
 from tests import plain, tiny
 from tests.runs.folders import create, edit
-from warpgs.captures.opening import load_capture
 from warpgs.config import RenderSettings, TrainConfig, fields
 from warpgs.config.presets import PRESETS
 from warpgs.runs import former
 from warpgs.runs.config_file import read_config, require_resumable
 from warpgs.training.schedule import Protocol
 from warpgs.training.train import train
-
-
-@pytest.fixture(scope="module")
-def capture(data):
-    return load_capture(data)
-
-
-@pytest.fixture
-def run(tmp_path, capture):
-    return create(dataclasses.replace(tiny.CONFIG, out=tmp_path / "run"), capture)
 
 
 def test_earlier_runs_keep_the_maximum_alpha_that_they_were_trained_with(tmp_path, capture):

@@ -10,7 +10,6 @@ import torch
 from tests import plain, tiny
 from tests.runs.folders import create, edit
 from tests.scenes import error
-from warpgs.captures.opening import load_capture
 from warpgs.config import TrainConfig, scaled
 from warpgs.config.presets import PRESETS
 from warpgs.locks import lock_folder
@@ -30,16 +29,6 @@ UNUSUAL = dataclasses.replace(
     damage_masks="erode:2,holes:0.25",
     lpips=Path("/weights"),
 )
-
-
-@pytest.fixture(scope="module")
-def capture(data):
-    return load_capture(data)
-
-
-@pytest.fixture
-def run(tmp_path, capture):
-    return create(dataclasses.replace(tiny.CONFIG, out=tmp_path / "run"), capture)
 
 
 @pytest.mark.parametrize("config", [*PRESETS.values(), scaled(PRESETS["best"]), UNUSUAL, tiny.CONFIG])

@@ -8,7 +8,7 @@ from .bounds import Bounds
 
 @dataclass(frozen=True)
 class OptimConfig:
-    """Learning rates of Adam; those of Deformable-3DGS where the paper names none, as those that are no options."""
+    """Learning rates of Adam: Deformable-3DGS's where the paper prints none, also those that have no option."""
 
     means: float = 5e-4
     """Positions [view sizes; scene units if ``densify.unit`` is extent]; decays exponentially to 1 %. 8e-4, the rate

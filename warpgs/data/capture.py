@@ -153,8 +153,8 @@ class Capture:
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
 
     Raises:
-        ValueError: If there are no training frames, or a camera has the distortion of a lens: all that is done with
-            frames takes them as images of pinholes.
+        ValueError: If there are no training frames, or a camera has the distortion of a lens: frames are used as
+            images of pinhole cameras everywhere.
     """
 
     name: str
