@@ -102,7 +102,13 @@ def names(model: Any) -> list[str]:
 def test_frames_with_a_scale_of_their_own_are_removed():
     assert names(continuous(in_two_parts([1, 1, 1, 1, 100, 100]))) == ["00", "01", "02", "03"]
     assert names(continuous(in_two_parts([1, 1, 1e-3, 1e-3, 1e-3]))) == ["02", "03", "04"]
-    assert names(continuous(in_two_parts([1, 1, -1, 1, 1, 1]))) == ["03", "04", "05"]  # in front of what it sees
+
+
+@pytest.mark.parametrize("wrong", [100.0, 1e-3, -1.0])  # -1: the frame is in front of what it sees
+def test_the_frames_around_up_to_two_with_a_scale_of_their_own_stay(wrong):
+    assert names(continuous(in_two_parts([1, 1, wrong, 1, 1]))) == ["00", "01", "03", "04"]
+    assert names(continuous(in_two_parts([1, 1, wrong, wrong, 1]))) == ["00", "01", "04"]
+    assert names(continuous(in_two_parts([1, 1, wrong, wrong, wrong, 1, 1, 1, 1]))) == ["05", "06", "07", "08"]
 
 
 def test_frames_of_a_camera_that_comes_nearer_stay():

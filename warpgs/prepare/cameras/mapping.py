@@ -32,6 +32,9 @@ MAX_DEPTH_RATIO = 3.0
 """Maximum ratio of the median depths of the points that two consecutive frames see. Of 34 reconstructions of DAVIS's
 clips whose cameras are right it is 1.4 at most, with every fourth frame 1.8; where the scale breaks, 6 to 10⁷."""
 
+MAX_SKIPPED = 2
+"""Maximum number of consecutive frames with a scale of their own between frames of one scale."""
+
 MIN_PARALLEL = 1_000
 """Number of residuals from which on bundle adjustment uses all cores; COLMAP's 50,000 leave most videos to one."""
 
@@ -134,21 +137,30 @@ def _supported(model: Any) -> Any:
 
 
 def continuous(model: Any) -> Any:
-    """The reconstruction without frames that have a scale of their own, of which all but the longest run are removed.
+    """The reconstruction without frames that have a scale of their own; the longest sequence of one scale remains.
 
     Frames that share few points with those before them, or hardly move, may end anywhere on the rays to these points.
-    Frames that see no point, such as those that are masked as a whole, are removed, too, but do not end a run.
+    At most ``MAX_SKIPPED`` of them in a row are skipped; more end a sequence, because what comes after them hangs on
+    them. Frames that see no point, such as those that are masked as a whole, are removed, too, but do not end it.
     """
     placed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     images = [image for image in placed if any(point.has_point3D() for point in image.points2D)]
-    depths = np.log([_median_depth(model, image) for image in images])
-    is_break = ~(np.abs(np.diff(depths)) <= math.log(MAX_DEPTH_RATIO))
-    runs = np.split(np.array(images, object), is_break.nonzero()[0] + 1)
-    kept = {image.image_id for image in max(runs, key=len)}
+    sequence = _longest_sequence([float(np.log(_median_depth(model, image))) for image in images])
+    kept = {images[k].image_id for k in sequence}
     for image in placed:
         if image.image_id not in kept:
             model.deregister_frame(image.frame_id)
     return model
+
+
+def _longest_sequence(log_depths: list[float]) -> list[int]:
+    """Indices of the frames of the longest sequence of one scale, see ``continuous``; the first one if several are."""
+    sequences: list[list[int]] = []  # the longest one that ends in each frame
+    for k, depth in enumerate(log_depths):
+        before = sequences[max(0, k - MAX_SKIPPED - 1) : k]
+        fitting = [s for s in before if s and abs(log_depths[s[-1]] - depth) <= math.log(MAX_DEPTH_RATIO)]
+        sequences.append([] if math.isnan(depth) else [*max(fitting, key=len, default=[]), k])
+    return max(sequences, key=len, default=[])
 
 
 def _median_depth(model: Any, image: Any) -> float:
