@@ -1,7 +1,7 @@
 """EWA projection of 3D Gaussians to splats (Zwicker et al. 2001; 3DGS Eq. 5; paper Eq. 3) and its backward pass.
 
-With the camera's rotation W and translation, t = W mean + translation, and the lens' point and Jacobian J at t
-(``lens_pinhole`` and the other files of this name):
+With the camera's rotation W and translation, t = W mean + translation, and the point and Jacobian J of its lens and
+shutter at t (``shutter``, ``lens_pinhole`` and the other files of this name):
 
     mean2d = point + offset · (width, height) / 2
     B      = J W R(q) diag(s),   cov2d = B Bᵀ = [[a', b], [b, c']],   a = a' + LOW_PASS, c = c' + LOW_PASS
@@ -20,12 +20,13 @@ a splat's elongation: at 200:1 it leaves nothing of the gradient of the length i
 product of scaled axes, cancels little.
 Through t, with v_t: v_mean = Wᵀ v_t, and for the camera the sums over all Gaussians of
     v_W = v_t meanᵀ + Jᵀ v_(JW),  v_translation = v_t
-and what the intrinsics and the distortion get through the point and J. Warp derives these, and v_t, from the lens.
+and what the intrinsics, the distortion and the motion get through the point, J and the depth. Warp derives these, and
+v_t, from the shutter.
 
 A Gaussian is culled (radius 0, everything else 0) unless it is beyond the near plane (for a wide lens, farther than
-that from the camera, and within the lens' largest angle), closer than FAR, reaches ALPHA_MIN, has an opacity of at
-most 1 before compensation, touches the image and has a finite, invertible 2D covariance. Every test is phrased so that
-NaN fails it.
+that from the camera, and within the lens' largest angle), at the middle row and at its own, closer than FAR, reaches
+ALPHA_MIN, has an opacity of at most 1 before compensation, touches the image and has a finite, invertible 2D
+covariance. Every test is phrased so that NaN fails it.
 """
 
 import functools
@@ -38,9 +39,11 @@ from .lens import Distortion, mat23
 from .lenses import LENSES, LensKernels
 from .quaternion import quaternion_to_rotation, quaternion_to_rotation_bwd, scaled_rotation
 from .rows import Splat, is_culled, make_pack_splat, make_unpack_splat
+from .shutter import make_load_motion, make_shutter, make_shutter_sum
 
 CAMERA_GRADIENTS = wp.constant(16)
-"""Length of a row of ``v_cameras`` without distortion: v_W by rows, v_translation, v of f_x, f_y, c_x, c_y."""
+"""Length of a row of ``v_cameras`` without what follows, distortion and motion: v_W by rows, v_translation, v of f_x,
+f_y, c_x, c_y."""
 
 LOG_ALPHA_MIN = wp.constant(math.log(ALPHA_MIN))
 MAX_EXTENT = wp.constant(1.0e8)
@@ -76,9 +79,8 @@ def store_camera_gradients(
     v_rotation: wp.mat33,
     v_focal: wp.vec2,
     v_center: wp.vec2,
-    v_distortion: Distortion,
 ):
-    """Row i of ``v_cameras``; ``v_rotation`` is the part of v_W that does not pass through t."""
+    """The first part of row i of ``v_cameras``; ``v_rotation`` is the part of v_W that does not pass through t."""
     for row in range(3):
         for column in range(3):
             v_cameras[i, 3 * row + column] = v_t[row] * mean[column] + v_rotation[row, column]
@@ -86,8 +88,6 @@ def store_camera_gradients(
     for axis in range(2):
         v_cameras[i, 12 + axis] = v_focal[axis]
         v_cameras[i, 14 + axis] = v_center[axis]
-    for part in range(v_cameras.shape[1] - CAMERA_GRADIENTS):
-        v_cameras[i, CAMERA_GRADIENTS + part] = v_distortion[part]
 
 
 @wp.func
@@ -110,9 +110,9 @@ def load_distortion(distortion: wp.array[float]) -> Distortion:
 
 
 @functools.cache
-def make_project(lens: LensKernels) -> wp.Function:
+def make_project(lens: LensKernels, is_rolling: bool) -> wp.Function:
     """Function that projects one Gaussian."""
-    lens_point, is_wide = lens.point, lens.is_wide
+    shutter, load_motion, is_wide = make_shutter(lens, is_rolling), make_load_motion(is_rolling), lens.is_wide
 
     @wp.func
     def project(
@@ -127,6 +127,7 @@ def make_project(lens: LensKernels) -> wp.Function:
         height: int,
         distortion: wp.array[float],
         limit: float,
+        motion: wp.array[wp.vec3],
         near: float,
         compensate: int,
         screen_offsets: wp.array[wp.vec2],
@@ -143,7 +144,14 @@ def make_project(lens: LensKernels) -> wp.Function:
         if not (depth > near and wp.length_sq(t) < FAR * FAR and wp.length_sq(quats[i]) > 0.0):
             return splat
         size = wp.vec2(float(width), float(height))
-        mean2d, jacobian = lens_point(t, focal_lengths(K), principal_point(K), size, load_distortion(distortion), limit)
+        turn, move = load_motion(motion)
+        mean2d, jacobian, row_depth = shutter(
+            t, turn, move, focal_lengths(K), principal_point(K), size, load_distortion(distortion), limit
+        )
+        if wp.static(is_rolling):
+            depth = row_depth
+            if not depth > near:
+                return splat
         spread = (jacobian * rotation) * scaled_rotation(quats[i], scales[i])
         a_sharp = wp.dot(spread[0], spread[0])
         b = wp.dot(spread[0], spread[1])
@@ -183,31 +191,9 @@ def make_project(lens: LensKernels) -> wp.Function:
 
 
 @functools.cache
-def make_lens_sum(lens: LensKernels) -> wp.Function:
-    """Function whose gradient is the backward pass of a lens: v_point · point and v_jacobian : J."""
-    lens_point = lens.point
-
-    @wp.func
-    def lens_sum(
-        t: wp.vec3,
-        focal: wp.vec2,
-        center: wp.vec2,
-        size: wp.vec2,
-        distortion: Distortion,
-        limit: float,
-        v_point: wp.vec2,
-        v_jacobian: mat23,
-    ) -> wp.vec2:
-        point, jacobian = lens_point(t, focal, center, size, distortion, limit)
-        return wp.vec2(wp.dot(v_point, point), wp.ddot(v_jacobian, jacobian))
-
-    return lens_sum
-
-
-@functools.cache
-def make_project_fwd(num_features: int, with_depth: bool, lens: str = "pinhole") -> wp.Kernel:
+def make_project_fwd(num_features: int, with_depth: bool, lens: str = "pinhole", is_rolling: bool = False) -> wp.Kernel:
     """Kernel that projects Gaussians and packs them, one thread for each."""
-    pack_splat, project = make_pack_splat(num_features, with_depth), make_project(LENSES[lens])
+    pack_splat, project = make_pack_splat(num_features, with_depth), make_project(LENSES[lens], is_rolling)
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_fwd(
@@ -222,6 +208,7 @@ def make_project_fwd(num_features: int, with_depth: bool, lens: str = "pinhole")
         height: int,
         distortion: wp.array[float],
         limit: float,
+        motion: wp.array[wp.vec3],
         near: float,
         compensate: int,
         screen_offsets: wp.array[wp.vec2],
@@ -246,6 +233,7 @@ def make_project_fwd(num_features: int, with_depth: bool, lens: str = "pinhole")
             height,
             distortion,
             limit,
+            motion,
             near,
             compensate,
             screen_offsets,
@@ -258,10 +246,10 @@ def make_project_fwd(num_features: int, with_depth: bool, lens: str = "pinhole")
 
 
 @functools.cache
-def make_project_bwd(num_features: int, with_depth: bool, lens: str = "pinhole") -> wp.Kernel:
+def make_project_bwd(num_features: int, with_depth: bool, lens: str = "pinhole", is_rolling: bool = False) -> wp.Kernel:
     """Kernel that turns gradient rows into the gradients of the Gaussians, one thread for each."""
-    unpack_splat, is_wide = make_unpack_splat(num_features, with_depth), LENSES[lens].is_wide
-    lens_sum = make_lens_sum(LENSES[lens])
+    unpack_splat = make_unpack_splat(num_features, with_depth)
+    shutter_sum, load_motion = make_shutter_sum(LENSES[lens], is_rolling), make_load_motion(is_rolling)
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_bwd(
@@ -276,6 +264,7 @@ def make_project_bwd(num_features: int, with_depth: bool, lens: str = "pinhole")
         height: int,
         distortion: wp.array[float],
         limit: float,
+        motion: wp.array[wp.vec3],
         compensate: int,
         rows: wp.array2d[wp.vec4],
         gradients: wp.array2d[wp.vec4],
@@ -304,9 +293,10 @@ def make_project_bwd(num_features: int, with_depth: bool, lens: str = "pinhole")
         center = principal_point(K)
         size = wp.vec2(float(width), float(height))
         coefficients = load_distortion(distortion)
+        turn, move = load_motion(motion)
         # The gradient by v_jacobian is J. After a plain call of the lens, Warp 1.19 would make no adjoint of it.
-        _t, _focal, _center, _size, _distortion, _limit, _point, jacobian = wp.grad(lens_sum)(
-            t, focal, center, size, coefficients, limit, wp.vec2(0.0), mat23(0.0)
+        _t, _turn, _move, _focal, _center, _size, _distortion, _limit, _point, jacobian, _depth = wp.grad(shutter_sum)(
+            t, turn, move, focal, center, size, coefficients, limit, wp.vec2(0.0), mat23(0.0), 0.0
         )
         to_image = jacobian * rotation
         q = quats[i]
@@ -350,16 +340,19 @@ def make_project_bwd(num_features: int, with_depth: bool, lens: str = "pinhole")
 
         v_to_image = v_spread * wp.transpose(shape)
         v_jacobian = v_to_image * wp.transpose(rotation)
-        v_t, v_focal, v_center, _size, v_distortion, _limit, _point, _jacobian = wp.grad(lens_sum)(
-            t, focal, center, size, coefficients, limit, v_splat.mean, v_jacobian
-        )
-        if wp.static(is_wide):
-            v_t += v_splat.depth * wp.normalize(t)
-        else:
-            v_t += wp.vec3(0.0, 0.0, v_splat.depth)
+        v_t, v_turn, v_move, v_focal, v_center, _size, v_distortion, _limit, _point, _jacobian, _depth = wp.grad(
+            shutter_sum
+        )(t, turn, move, focal, center, size, coefficients, limit, v_splat.mean, v_jacobian, v_splat.depth)
         v_means[i] = wp.transpose(rotation) * v_t
         if v_cameras.shape[1] > 0:
             v_rotation = wp.transpose(jacobian) * v_to_image
-            store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, v_focal, v_center, v_distortion)
+            store_camera_gradients(v_cameras, i, means[i], v_t, v_rotation, v_focal, v_center)
+            for part in range(distortion.shape[0]):
+                v_cameras[i, CAMERA_GRADIENTS + part] = v_distortion[part]
+            if wp.static(is_rolling):
+                after = CAMERA_GRADIENTS + distortion.shape[0]
+                for axis in range(3):
+                    v_cameras[i, after + axis] = v_turn[axis]
+                    v_cameras[i, after + 3 + axis] = v_move[axis]
 
     return project_bwd

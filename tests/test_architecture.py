@@ -16,7 +16,7 @@ ORDER = [
     "kernels",
     "runtime",
     "ops",
-    "distortion cameras least_squares",
+    "distortion shutter cameras least_squares",
     "model",
     "rendering",
     "visualize",

@@ -77,15 +77,31 @@ def test_five_channels_equal_those_on_cpu():
         assert relative_error(actual, expected) < 1e-5
 
 
+@pytest.mark.parametrize("is_rolling", [False, True])
 @pytest.mark.parametrize(("lens", "coefficients"), [("radial", [-0.2, 0.05, 0.01]), ("fisheye", [0.05, -0.02])])
-def test_images_and_gradients_through_a_lens_equal_those_on_cpu(lens, coefficients):
+def test_images_and_gradients_through_a_lens_equal_those_on_cpu(lens, coefficients, is_rolling):
     def pull(device):
         splats, view = as_leaves(make_splats(200).to(device)), make_camera().to(device)
         values = torch.tensor(coefficients, requires_grad=True)
         distortion = getattr(Distortion, lens)(values, view.K, view.size)
-        image = render(splats, dataclasses.replace(view, distortion=distortion)).joint.image
+        motion = torch.tensor([[0.05, -0.08, 0.03], [0.1, 0.06, -0.05]], device=device, requires_grad=True)
+        parts = {"distortion": distortion, "motion": motion if is_rolling else None}
+        image = render(splats, dataclasses.replace(view, **parts)).joint.image
         image.square().sum().backward()
-        return [t.detach().cpu() for t in (image, values.grad, *gradients(splats).values())]
+        trained = (values, motion) if is_rolling else (values,)
+        return [t.detach().cpu() for t in (image, *(t.grad for t in trained), *gradients(splats).values())]
+
+    for actual, expected in zip(pull("cuda"), pull("cpu"), strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+def test_images_and_gradients_through_a_rolling_shutter_equal_those_on_cpu():
+    def pull(device):
+        splats = as_leaves(make_splats(200).to(device))
+        motion = torch.tensor([[0.05, -0.08, 0.03], [0.1, 0.06, -0.05]], device=device, requires_grad=True)
+        image = render(splats, dataclasses.replace(make_camera().to(device), motion=motion)).joint.image
+        image.square().sum().backward()
+        return [t.detach().cpu() for t in (image, motion.grad, *gradients(splats).values())]
 
     for actual, expected in zip(pull("cuda"), pull("cpu"), strict=True):
         assert relative_error(actual, expected) < 1e-5

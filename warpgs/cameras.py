@@ -1,4 +1,4 @@
-"""Cameras: pinholes, or with the distortion of a lens."""
+"""Cameras: pinholes with a global shutter, or with the distortion of a lens and a rolling shutter."""
 
 import dataclasses
 import math
@@ -13,10 +13,14 @@ from torch import Tensor
 
 from .distortion import Distortion
 from .runtime.checks import as_number, as_whole_number, check_image_size, check_same_device, check_tensor, one_line_repr
+from .shutter import MAX_READOUT, at_middle_row, at_row
 
 Point = Shaped[Tensor, "3"] | Shaped[np.ndarray, "3"] | Sequence[float]
 """Three numbers."""
 
+NUM_ROW_STEPS = 4
+"""Steps of the fixed point that finds the row at which a rolling shutter sees a point; each leaves as much of the error
+as the point moves over of the image's height during the readout."""
 
 MAX_ANGLE = 30.0
 """Maximum angle between the orientations of two cameras whose images are compared; farther apart, optical flow is no
@@ -39,6 +43,10 @@ class Camera:
         height: Height of the image [px].
         time: Time in [0, 1].
         distortion: Of its lens; None for a pinhole.
+        motion: [2, 3] how a camera with a rolling shutter turns and moves while its rows are read from the first to the
+            last, in its own axes at the middle row, which ``viewmat`` is the pose of: a rotation vector of at most a
+            right angle [radians] and a translation [scene units]. View-dependent colours are those at the middle row.
+            None for a global shutter.
 
     Raises:
         ValueError: On a wrong shape, dtype, device or size, or a time that is not a number.
@@ -50,6 +58,7 @@ class Camera:
     height: int
     time: float = 0.0
     distortion: Distortion | None = None
+    motion: Float[Tensor, "2 3"] | None = None
 
     def __post_init__(self) -> None:
         check_tensor("viewmat", self.viewmat, (4, 4), {})
@@ -57,7 +66,10 @@ class Camera:
         if not isinstance(self.distortion, Distortion | None):
             raise ValueError(f"distortion must be a Distortion or None, got {type(self.distortion).__name__}")
         coefficients = None if self.distortion is None else self.distortion.coefficients
-        check_same_device({"viewmat": self.viewmat, "K": self.K, "distortion": coefficients})
+        if self.motion is not None:
+            check_tensor("motion", self.motion, (2, 3), {})
+        tensors = {"K": self.K, "distortion": coefficients, "motion": self.motion}
+        check_same_device({"viewmat": self.viewmat, **tensors})
         object.__setattr__(self, "width", as_whole_number(self.width))
         object.__setattr__(self, "height", as_whole_number(self.height))
         check_image_size(self.width, self.height)
@@ -76,7 +88,9 @@ class Camera:
     def to(self, device: torch.device | str) -> "Camera":
         """A copy on another device."""
         distortion = None if self.distortion is None else self.distortion.to(device)
-        return dataclasses.replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device), distortion=distortion)
+        motion = None if self.motion is None else self.motion.to(device)
+        viewmat, K = self.viewmat.to(device), self.K.to(device)
+        return dataclasses.replace(self, viewmat=viewmat, K=K, distortion=distortion, motion=motion)
 
     def resized(self, width: int, height: int) -> "Camera":
         """The same view as an image of another size."""
@@ -91,11 +105,30 @@ class Camera:
     def depths(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
         """Depth of points of the world along the optical axis [scene units], negative behind the camera.
 
-        With a fisheye lens, which may see what is behind the camera, it is their distance from it.
+        With a fisheye lens, which may see what is behind the camera, it is their distance from it; with a rolling
+        shutter, it is depth at the row that sees them.
         """
+        return self._depths(self._viewed(points))
+
+    def _depths(self, viewed: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
         if self.distortion is not None and self.distortion.measures_distance:
-            return (points - self.position).norm(dim=1)
-        return points @ self.viewmat[2, :3] + self.viewmat[2, 3]
+            return viewed.norm(dim=1)
+        return viewed[:, 2]
+
+    def _pixels(self, viewed: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
+        """[P, 2] where points in camera space are in the image [px]; anything where they are not seen."""
+        if self.distortion is None:
+            return (viewed @ self.K.T)[:, :2] / viewed[:, 2:].clamp_min(1e-6)
+        return self.distortion.bend(viewed) * self.K.diagonal()[:2] + self.K[:2, 2]
+
+    def _viewed(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+        """[P, 3] points of the world in the axes of the camera, with a rolling shutter at the row that sees them."""
+        viewed = in_row = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+        if self.motion is not None:
+            for _ in range(NUM_ROW_STEPS):
+                s = (self._pixels(in_row)[:, 1] / self.height - 0.5).nan_to_num(0.0).clamp(-MAX_READOUT, MAX_READOUT)
+                in_row = at_row(viewed, self.motion, s)
+        return in_row
 
     def project(
         self, points: Float[Tensor, "P 3"]
@@ -106,14 +139,10 @@ class Camera:
             Row and column of the pixel of each point, clamped to the image; its ``depths`` [scene units]; and whether
             the lens sees it and it is inside the image.
         """
-        viewed = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        depth = self.depths(points)
-        if self.distortion is None:
-            pixels, is_seen = (viewed @ self.K.T)[:, :2] / depth[:, None].clamp_min(1e-6), depth > 1e-6
-        else:
-            pixels = self.distortion.bend(viewed) * self.K.diagonal()[:2] + self.K[:2, 2]
-            is_seen = (depth > 1e-6) & self.distortion.sees(viewed)
-        x, y = pixels.nan_to_num(-1.0).floor().unbind(1)
+        viewed = self._viewed(points)
+        depth = self._depths(viewed)
+        is_seen = (depth > 1e-6) & (True if self.distortion is None else self.distortion.sees(viewed))
+        x, y = self._pixels(viewed).nan_to_num(-1.0).floor().unbind(1)
         is_visible = is_seen & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
         return y.clamp(0, self.height - 1).long(), x.clamp(0, self.width - 1).long(), depth, is_visible
 
@@ -127,6 +156,8 @@ class Camera:
         pixels = torch.stack([column.to(depth) + 0.5, row.to(depth) + 0.5, torch.ones_like(depth)], 1)
         rays = pixels @ torch.linalg.inv(self.K).T
         viewed = (rays if self.distortion is None else self.distortion.rays(rays[:, :2])) * depth[:, None]
+        if self.motion is not None:
+            viewed = at_middle_row(viewed, self.motion, pixels[:, 1] / self.height - 0.5)
         return (viewed - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
 
     @staticmethod

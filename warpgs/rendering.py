@@ -91,6 +91,7 @@ class _Inputs(NamedTuple):
     viewmat: Any
     K: Any
     distortion: Any
+    motion: Any
     background: Any
     screen_offsets: Any
     branch: Any
@@ -109,6 +110,7 @@ class _Saved(NamedTuple):
     viewmat: Tensor
     K: Tensor
     distortion: Tensor | None
+    motion: Tensor | None
     background: Tensor | None
     sh: Any
     colors: Any
@@ -157,7 +159,7 @@ def render(
 def opacities_on_screen(splats: Splats, camera: Camera, settings: RenderSettings = DEFAULTS) -> Float[Tensor, " N"]:
     """[N] opacities with which ``render`` composites splats: with ``antialias`` compensated, of culled ones 0."""
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
-    view = View(camera.viewmat, camera.K, *camera.size, _coefficients(camera), *_lens(camera))
+    view = View(camera.viewmat, camera.K, *camera.size, _coefficients(camera), *_lens(camera), camera.motion)
     rows, *_ = project_fwd(geometry, splats.means, view, settings.near, settings.antialias, with_depth=False)
     return rows.opacities
 
@@ -178,13 +180,17 @@ def _coefficients(camera: Camera) -> Tensor | None:
     return None if camera.distortion is None else camera.distortion.coefficients
 
 
+def _view(tensors: _Inputs | _Saved, request: _Request) -> View:
+    return View(tensors.viewmat, tensors.K, *request.size, tensors.distortion, *request.lens, tensors.motion)
+
+
 def _inputs(
     splats: Splats, camera: Camera, background: Tensor | None, settings: RenderSettings, screen_offsets: Tensor | None
 ) -> _Inputs:
     geometry = splats.means, splats.quats, splats.scales, splats.opacities
     appearance = splats.colors if splats.sh is None else splats.sh
     branch = splats.is_dynamic.view(torch.uint8) if settings.branches and splats.is_dynamic is not None else None
-    view = camera.viewmat, camera.K, _coefficients(camera)
+    view = camera.viewmat, camera.K, _coefficients(camera), camera.motion
     return _Inputs(*geometry, appearance, *view, background, screen_offsets, branch)
 
 
@@ -223,8 +229,8 @@ def _check_inputs(
 
 def _forward(request: _Request, *tensors: Any) -> Recorded:
     """(color →) project → bin → composite; every differentiable step records its backward function on one tape."""
-    inputs, (size, lens, settings, _, sh_degree) = _Inputs._make(tensors), request
-    geometry, view = Geometry(*inputs[:4]), View(inputs.viewmat, inputs.K, *size, inputs.distortion, *lens)
+    inputs, (size, _, settings, _, sh_degree) = _Inputs._make(tensors), request
+    geometry, view = Geometry(*inputs[:4]), _view(inputs, request)
     back, tape = _Backward(request, _has_gradient(inputs.screen_offsets)), Tape()
 
     features, sh, colors = inputs.appearance, None, None
@@ -242,7 +248,7 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     tape.record_func(back.composite, [])
 
     alphas = composite.alphas if _has_gradient(inputs.background) else ()
-    saved = _Saved(*geometry, *inputs[5:8], inputs.background, sh, colors, rows.packed)
+    saved = _Saved(*geometry, *inputs[5:9], inputs.background, sh, colors, rows.packed)
     num_intersections = () if settings.max_intersections is None else (tiles.num_isects,)
     return Recorded(
         outputs=composite.layers,
@@ -296,13 +302,12 @@ class _Backward:
 
     def project(self) -> None:
         saved, v = self.saved, self.v
-        size, lens = self.request.size, self.request.lens
-        geometry, view = Geometry(*saved[:4]), View(saved.viewmat, saved.K, *size, saved.distortion, *lens)
-        inputs = (geometry, view, self.request.settings.antialias, self._rows())
+        geometry = Geometry(*saved[:4])
+        inputs = (geometry, _view(saved, self.request), self.request.settings.antialias, self._rows())
         splats = project_bwd(*inputs, v["rows"], self.with_offsets, self.absgrad)
         v |= splats.geometry._asdict()
         v["appearance"], v["viewmat"], v["K"] = splats.features, splats.viewmat, splats.K
-        v["distortion"] = splats.distortion
+        v["distortion"], v["motion"] = splats.distortion, splats.motion
         v["screen_offsets"] = splats.screen_offsets
 
     def color(self) -> None:

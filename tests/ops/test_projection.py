@@ -62,7 +62,7 @@ def gradients(tensors, view, v_rows, antialias=False):
 
 def assert_same_gradients(tensors, view, v_rows, antialias, of_camera=False):
     """Compares the backward pass with that of the reference in double precision; returns what is visible."""
-    names = [name for name in ("viewmat", "K", "distortion") if getattr(view, name) is not None]
+    names = [name for name in ("viewmat", "K", "distortion", "motion") if getattr(view, name) is not None]
     parts = {name: getattr(view, name).clone().requires_grad_(of_camera) for name in names}
     v = gradients(tensors, view._replace(**parts), v_rows, antialias)
 

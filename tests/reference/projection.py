@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tests.reference import lenses
+from tests.reference import lenses, shutter
 from tests.reference.covariance import covariance
 from warpgs.ops.projection import Geometry, View
 
@@ -19,7 +19,8 @@ class Projection(NamedTuple):
     Attributes:
         means2d: [N, 2] centres [px].
         conics: [N, 3] entries xx, xy, yy of the inverse 2D covariance [1/px²].
-        depths: [N] z in camera space, for a fisheye lens the distance from the camera [scene units].
+        depths: [N] z in camera space, for a fisheye lens the distance from the camera, at the row of a rolling
+            shutter [scene units].
         opacities: [N] in [0, 1], with antialiasing compensated for the low-pass filter.
         radii: [N, 2] int32 half sizes on screen [px]; 0 = culled.
     """
@@ -40,7 +41,12 @@ def project(
     t = means @ W.T + translation
     depth, seen = depth_and_visibility(t, view, near)
     t = torch.where(seen[:, None], t, torch.tensor([0.1, 0.1, 1.0], dtype=t.dtype))
-    means2d, J = lenses.point_and_jacobian(t, view)
+    if view.motion is None:
+        means2d, J = lenses.point_and_jacobian(t, view)
+    else:
+        means2d, J, t = shutter.point_and_jacobian(t, view)
+        depth, seen_at_row = depth_and_visibility(t, view, near)
+        seen = seen & seen_at_row
     sharp = J @ W @ covariance(quats, scales) @ W.T @ J.mT
     blurred = sharp + LOW_PASS * torch.eye(2, dtype=means.dtype)
     det = torch.linalg.det(blurred)

@@ -67,6 +67,14 @@ def test_a_camera_with_distortion_plays_as_it_is_rendered(trained, captured):
     assert not torch.equal(trained.play(camera), trained.play(pinhole))
 
 
+def test_a_camera_with_a_rolling_shutter_plays_as_it_is_rendered(trained, captured):
+    still = scenes.camera()
+    camera = dataclasses.replace(still, motion=torch.tensor([[0.0, 0.1, 0.0], [0.2, 0.0, 0.0]]))
+    trained.play(still)
+    assert torch.equal(trained.play(camera), trained.render(camera).joint.image)
+    assert not torch.equal(trained.play(camera), trained.play(still))
+
+
 def test_a_time_of_numpy_is_rendered_like_one_of_python(trained):
     expected = trained.render(scenes.camera(), time=0.25).joint.image
     (time,) = np.linspace(0.25, 1.0, 1)

@@ -17,7 +17,7 @@ from warpgs.runtime.profiling import profile
 def project(means, quats, scales, opacities, near, offsets) -> torch.Tensor:
     """[N, 4] means on screen and radii."""
     camera, features, radii = make_camera(), torch.zeros(len(means), 3), torch.zeros(len(means), 2, dtype=torch.int32)
-    view = (camera.viewmat, camera.K, *camera.size, None, 0.0)
+    view = (camera.viewmat, camera.K, *camera.size, None, 0.0, None)
     inputs = (means, quats, scales, opacities, *view, near, 0, offsets, features)
     rows = new_rows(features, with_depth=False)
     kernel = make_project_fwd(rows.num_features, rows.with_depth)

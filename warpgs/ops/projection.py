@@ -39,6 +39,8 @@ class View(NamedTuple):
         limit: How far from the axis the lens' formula holds: a radius on the plane z = 1 (radial), or an angle
             (fisheye) [radians], beyond which nothing is seen.
         lens: Name of the lens, a key of ``kernels.lenses.LENSES``.
+        motion: [2, 3] how the camera turns (rotation vector [radians]) and moves while its rows are read from first to
+            last, in its own axes; ``viewmat`` is at the middle row then. None for a global shutter.
     """
 
     viewmat: Float[Tensor, "4 4"]
@@ -48,6 +50,17 @@ class View(NamedTuple):
     distortion: Float[Tensor, " C"] | None = None
     limit: float = 0.0
     lens: str = "pinhole"
+    motion: Float[Tensor, "2 3"] | None = None
+
+    @property
+    def arguments(self) -> tuple[Tensor | int | float | None, ...]:
+        """Of the kernels."""
+        return (*self[:6], self.motion)
+
+    @property
+    def variant(self) -> tuple[str, bool]:
+        """Of the kernels: lens and shutter."""
+        return self.lens, self.motion is not None
 
 
 class SplatGradients(NamedTuple):
@@ -59,6 +72,7 @@ class SplatGradients(NamedTuple):
     K: Tensor | None
     screen_offsets: Tensor | None
     distortion: Tensor | None = None
+    motion: Tensor | None = None
 
 
 def project_fwd(
@@ -90,8 +104,8 @@ def project_fwd(
         of binning.
     """
     rows, radii = new_rows(features, with_depth), features.new_empty(features.shape[0], 2, dtype=int32)
-    order, kernel = new_order(radii), kernels.make_project_fwd(rows.num_features, with_depth, view.lens)
-    inputs = (*geometry, *view[:-1], near, int(antialias), screen_offsets, features)
+    order, kernel = new_order(radii), kernels.make_project_fwd(rows.num_features, with_depth, *view.variant)
+    inputs = (*geometry, *view.arguments, near, int(antialias), screen_offsets, features)
     launch(kernel, features.shape[0], *inputs, radii, rows.packed, *order)
     return rows, radii, order
 
@@ -117,22 +131,24 @@ def project_bwd(
     new, N = geometry.means.new_empty, geometry.means.shape[0]
     v_geometry = Geometry(new(N, 3), new(N, 4), new(N, 3), new(N))  # torch.empty_like takes the host longer
     v_features, v_offsets = new(N, rows.num_features), new(N, 2) if with_offsets else None
-    is_trained = any(part is not None and part.requires_grad for part in (view.viewmat, view.K, view.distortion))
-    num_coefficients = 0 if view.distortion is None else len(view.distortion)
-    v_cameras = new(N, kernels.CAMERA_GRADIENTS + num_coefficients) if is_trained else None
+    others = [part for part in (view.distortion, view.motion) if part is not None]
+    is_trained = any(part.requires_grad for part in (view.viewmat, view.K, *others))
+    num_others = sum(part.numel() for part in others)
+    v_cameras = new(N, kernels.CAMERA_GRADIENTS + num_others) if is_trained else None
     v_parts = v_rows.view(*v_rows.shape[:2], v_rows.shape[2] // 4, 4)  # pieces of 16 bytes
-    inputs = (*geometry, *view[:-1], int(antialias), rows.packed, v_parts, int(absgrad))
-    kernel = kernels.make_project_bwd(rows.num_features, rows.with_depth, view.lens)
+    inputs = (*geometry, *view.arguments, int(antialias), rows.packed, v_parts, int(absgrad))
+    kernel = kernels.make_project_bwd(rows.num_features, rows.with_depth, *view.variant)
     launch(kernel, N, *inputs, v_features, v_offsets, *v_geometry, v_cameras)
-    camera = (None, None, None) if v_cameras is None else _sum_over_gaussians(view, v_cameras)
-    v_viewmat, v_K, v_distortion = camera
-    return SplatGradients(v_geometry, v_features, v_viewmat, v_K, v_offsets, v_distortion)
+    v_viewmat, v_K, *v_others = (None,) * 4 if v_cameras is None else _sum_over_gaussians(view, v_cameras)
+    return SplatGradients(v_geometry, v_features, v_viewmat, v_K, v_offsets, *v_others)
 
 
-def _sum_over_gaussians(view: View, v_cameras: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Gradients of ``viewmat``, ``K`` and ``distortion`` from what each Gaussian contributes."""
+def _sum_over_gaussians(view: View, v_cameras: Tensor) -> tuple[Tensor | None, ...]:
+    """Gradients of ``viewmat``, ``K``, ``distortion`` and ``motion`` from what each Gaussian contributes."""
     sums = v_cameras.sum(0)
     v_viewmat, v_K = torch.zeros_like(view.viewmat), torch.zeros_like(view.K)  # their last rows are constant
     v_viewmat[:3, :3], v_viewmat[:3, 3] = sums[:9].view(3, 3), sums[9:12]
     v_K[0, 0], v_K[1, 1], v_K[0, 2], v_K[1, 2] = sums[12:16].unbind()
-    return v_viewmat, v_K, None if view.distortion is None else sums[16:]
+    num = 0 if view.distortion is None else len(view.distortion)
+    v_distortion = None if view.distortion is None else sums[16 : 16 + num]
+    return v_viewmat, v_K, v_distortion, None if view.motion is None else sums[16 + num :].view(2, 3)

@@ -143,7 +143,7 @@ class TrainedScene:
         is then the same tensor in every call, with new values. Raises as ``render``.
         """
         require_camera(camera)
-        if not self.uses_graphs or camera.distortion is not None:
+        if not self.uses_graphs or camera.distortion is not None or camera.motion is not None:
             return self.render(camera).joint.image
         require_time(camera.time)
         if self._inputs is None:
