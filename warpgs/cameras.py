@@ -22,6 +22,9 @@ NUM_ROW_STEPS = 4
 """Steps of the fixed point that finds the row at which a rolling shutter sees a point; each leaves as much of the error
 as the point moves over of the image's height during the readout."""
 
+MIN_DEPTH = 1e-6
+"""Depth above which a point is in front of the camera [scene units]."""
+
 MAX_ANGLE = 30.0
 """Maximum angle between the orientations of two cameras whose images are compared; farther apart, optical flow is no
 evidence [degrees]."""
@@ -110,23 +113,12 @@ class Camera:
         """
         return self._depths(self._viewed(points))
 
-    def _depths(self, viewed: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        if self.distortion is not None and self.distortion.measures_distance:
-            return viewed.norm(dim=1)
-        return viewed[:, 2]
-
-    def _pixels(self, viewed: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
-        """[P, 2] where points in camera space are in the image [px]; anything where they are not seen."""
-        if self.distortion is None:
-            return (viewed @ self.K.T)[:, :2] / viewed[:, 2:].clamp_min(1e-6)
-        return self.distortion.bend(viewed) * self.K.diagonal()[:2] + self.K[:2, 2]
-
     def _viewed(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
         """[P, 3] points of the world in the axes of the camera, with a rolling shutter at the row that sees them."""
         viewed = in_row = points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
         if self.motion is not None:
             for _ in range(NUM_ROW_STEPS):
-                s = (self._pixels(in_row)[:, 1] / self.height - 0.5).nan_to_num(0.0).clamp(-MAX_READOUT, MAX_READOUT)
+                s = (self.place(in_row)[0][:, 1] / self.height - 0.5).clamp(-MAX_READOUT, MAX_READOUT)
                 in_row = at_row(viewed, self.motion, s)
         return in_row
 
@@ -139,12 +131,31 @@ class Camera:
             Row and column of the pixel of each point, clamped to the image; its ``depths`` [scene units]; and whether
             the lens sees it and it is inside the image.
         """
-        viewed = self._viewed(points)
-        depth = self._depths(viewed)
-        is_seen = (depth > 1e-6) & (True if self.distortion is None else self.distortion.sees(viewed))
-        x, y = self._pixels(viewed).nan_to_num(-1.0).floor().unbind(1)
+        positions, depth, is_seen = self.place(self._viewed(points))
+        x, y = positions.floor().unbind(1)
         is_visible = is_seen & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
         return y.clamp(0, self.height - 1).long(), x.clamp(0, self.width - 1).long(), depth, is_visible
+
+    def place(
+        self, viewed: Float[Tensor, "P 3"]
+    ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"], Bool[Tensor, " P"]]:
+        """Positions of points in camera space [px], -1 where there is none; depth as of ``depths``; whether it is seen.
+
+        Positions may be outside of the image. Computed in the precision of the points; camera space is that at the row
+        of a point, with a rolling shutter.
+        """
+        K = self.K.to(viewed)
+        depth = self._depths(viewed)
+        if self.distortion is None:
+            bent, is_seen = viewed[:, :2] / depth[:, None].clamp_min(MIN_DEPTH), depth > MIN_DEPTH
+        else:
+            bent, is_seen = self.distortion.bend(viewed), (depth > MIN_DEPTH) & self.distortion.sees(viewed)
+        return (bent * K.diagonal()[:2] + K[:2, 2]).nan_to_num(-1.0), depth, is_seen
+
+    def _depths(self, viewed: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
+        if self.distortion is not None and self.distortion.measures_distance:
+            return viewed.norm(dim=1)
+        return viewed[:, 2]
 
     def unproject(
         self, row: Int64[Tensor, " P"], column: Int64[Tensor, " P"], depth: Float[Tensor, " P"]
@@ -153,12 +164,36 @@ class Camera:
 
         They are NaN at pixels that show nothing: the corners of a fisheye lens' circular image.
         """
-        pixels = torch.stack([column.to(depth) + 0.5, row.to(depth) + 0.5, torch.ones_like(depth)], 1)
-        rays = pixels @ torch.linalg.inv(self.K).T
-        viewed = (rays if self.distortion is None else self.distortion.rays(rays[:, :2])) * depth[:, None]
+        positions = torch.stack([column, row], 1).to(depth) + 0.5
+        viewed = self.rays(positions) * depth[:, None]
         if self.motion is not None:
-            viewed = at_middle_row(viewed, self.motion, pixels[:, 1] / self.height - 0.5)
+            viewed = at_middle_row(viewed, self.motion, positions[:, 1] / self.height - 0.5)
         return (viewed - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
+
+    def rays(self, positions: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
+        """[P, 3] points in camera space, as of ``place``, at depth 1 that are seen at positions [px], NaN at none."""
+        K = self.K.to(positions)
+        slopes = (positions - K[:2, 2]) / K.diagonal()[:2]
+        if self.distortion is None:
+            return torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1)
+        return self.distortion.rays(slopes)
+
+    def pixel_areas(self, positions: Float[Tensor, "P 2"]) -> Float[Tensor, " P"]:
+        """[P] area at depth 1 of the pixels around positions [px from the corner], NaN where nothing is seen."""
+        x, y = positions.new_tensor([0.5, 0.0]), positions.new_tensor([0.0, 0.5])
+        across, down = (self.rays(positions + half) - self.rays(positions - half) for half in (x, y))
+        return torch.linalg.cross(across, down).norm(dim=1)
+
+    @property
+    def pixel_centers(self) -> Float[Tensor, "P 2"]:
+        """[H W, 2] centre of every pixel, row by row [px from the corner]."""
+        x, y = (torch.arange(side, dtype=torch.float32, device=self.K.device) + 0.5 for side in self.size)
+        return torch.cartesian_prod(y, x).flip(1)
+
+    @property
+    def pinhole(self) -> "Camera":
+        """The camera without the distortion of its lens and with a global shutter."""
+        return dataclasses.replace(self, distortion=None, motion=None)
 
     @staticmethod
     def posed(

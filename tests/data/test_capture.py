@@ -8,7 +8,6 @@ import torch
 from warpgs.cameras import Camera
 from warpgs.data import capture as capture_module
 from warpgs.data.capture import Capture, Frame, missing_view
-from warpgs.distortion import Distortion
 
 
 def camera(x: float) -> Camera:
@@ -35,13 +34,6 @@ def test_opening_a_capture_reads_no_frame():
 
 def test_a_capture_is_shown_in_one_line():
     assert repr(make_capture()[0]) == "<Capture c: 3 frames to train on, 0 to evaluate on, 0 points>"
-
-
-def test_a_capture_refuses_cameras_with_distortion():
-    capture, _ = make_capture()
-    bent = dataclasses.replace(capture.cameras["f1"], distortion=Distortion("fisheye", torch.zeros(4), 1.0))
-    with pytest.raises(ValueError, match="undistorted frames: the camera of f1 has a distortion"):
-        dataclasses.replace(capture, cameras={**capture.cameras, "f1": bent})
 
 
 def test_frames_are_sorted_by_their_times_and_names():

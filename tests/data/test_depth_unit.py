@@ -1,5 +1,6 @@
 """Depth in another unit than that of the cameras, and inverse depth where depth is expected."""
 
+import dataclasses
 import json
 import shutil
 
@@ -9,9 +10,11 @@ import pytest
 
 from tests.data import layouts
 from tests.data.captures import edit_json, write_array, write_json
+from tests.lens_captures import CAMERAS, recorded
 from tests.prepare import boards
 from warpgs.captures.check import check_capture, quick_findings
 from warpgs.captures.opening import load_capture
+from warpgs.data.depth_unit import fit_unit
 
 COUNT = 16
 
@@ -141,6 +144,17 @@ def test_inverse_depth_where_metric_depth_is_expected_is_called_so(tmp_path, wit
         write_array(root / f"depth/1x/shot{k:03d}.npy", (1 / boards.depth(view)).astype(np.float32))
     report = check_capture(root, "iphone", factor=1)
     assert "it shrinks with distance, as inverse depth and disparities do, but must be depth" in str(report)
+
+
+@pytest.mark.parametrize("lens", CAMERAS)
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_the_unit_of_depth_is_told_through_a_lens(lens, factor):
+    capture = recorded(lens, is_metric=True)
+    frames = [capture.frame(name) for name in capture.train]
+    found = fit_unit([dataclasses.replace(frame, inverse_depth=factor * frame.inverse_depth) for frame in frames])
+    assert found.best > 0.5
+    assert found.factor == pytest.approx(factor, rel=0.2)
+    assert found.is_wrong == (factor != 1.0)
 
 
 def test_depth_of_other_programs_fits_their_cameras(tmp_path):

@@ -10,6 +10,7 @@ from tests import tiny
 from tests.data.captures import ids_of, write_capture
 from warpgs.captures.opening import load_capture
 from warpgs.data.capture import Capture
+from warpgs.distortion import Distortion
 from warpgs.model.poses import PoseCorrections
 from warpgs.views.pixels import mask_border
 from warpgs.views.views import Views
@@ -48,6 +49,36 @@ def assert_same(a, b):
     assert torch.equal(a.camera.viewmat, b.camera.viewmat)
     assert torch.equal(a.camera.K, b.camera.K)
     assert a.camera.size == b.camera.size
+
+
+def test_each_view_has_the_motion_of_its_camera(capture):
+    second = capture.train[1]
+    assert views_of(capture)[0].camera.motion is None
+    camera = dataclasses.replace(capture.cameras[second], motion=torch.full((2, 3), 0.01))
+    views = views_of(capture.with_cameras({second: camera}))
+    assert [float(views[index].camera.motion.max()) for index in (0, 1)] == pytest.approx([0.0, 0.01])
+
+
+@pytest.mark.parametrize("resident_bytes", [PLENTY, 0])
+def test_each_view_has_the_lens_of_its_camera(capture, resident_bytes):
+    first, second, third, *_ = capture.train
+    cameras = {name: capture.cameras[name] for name in (first, second, third)}
+    bent = {
+        first: Distortion.radial([0.1, 0.02], cameras[first].K, cameras[first].size),
+        second: Distortion.fisheye([0.03], cameras[second].K, cameras[second].size),
+        third: Distortion.radial([0.0, 0.0, 0.01], cameras[third].K, cameras[third].size),
+    }
+    moved = capture.with_cameras({n: dataclasses.replace(c, distortion=bent[n]) for n, c in cameras.items()})
+    views = views_of(moved, resident_bytes)
+    for index, name in enumerate(capture.train[:4]):
+        views.select(index)
+        for view in (views[index], views.selected()):
+            found, expected = view.camera.distortion, bent.get(name)
+            if expected is None or found is None:
+                assert found is expected
+            else:
+                assert (found.lens, found.limit) == (expected.lens, expected.limit)
+                assert torch.equal(found.coefficients, expected.coefficients)
 
 
 def test_times_of_numpy_are_single_precision(capture):

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera, are_comparable
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between, grey_at, grey_levels
+from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between, grey_levels
 from warpgs.data.resized import size_within
 from warpgs.data.sampling import evenly_spaced
 from warpgs.visualize.images import seen_from
@@ -63,8 +63,9 @@ class Motion:
 def motion_between(first: Frame, second: Frame) -> Motion | None:
     """Compares the optical flow (DIS) from the first frame to the second with the epipolar lines of their cameras.
 
-    The second image is first brought to the orientation, focal length and shape of the first, so that frames of any
-    shapes can be compared. Only pixels count whose flow back leads to where they came from.
+    Both images are first brought to the orientation, focal length and shape of the first, without the distortion of its
+    lens, so that frames of any cameras can be compared. Only pixels count whose flow back leads to where they came
+    from.
 
     Returns:
         The motion; None if too few pixels have texture and flow, the cameras are too far apart (``are_comparable``), or
@@ -73,18 +74,20 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
     size = size_within(first.camera.size, COMPARED_SIDE)
     if min(*size, *second.camera.size) < MIN_SIDE or not are_comparable(first.camera, second.camera):
         return None
-    a, (b, is_seen) = grey_at(first, size), _turned_like(first.camera, second, size)
+    shown = first.camera.pinhole.resized(*size)
+    (a, is_there), (b, is_seen) = (_seen_from(shown, frame) for frame in (first, second))
     flow, agrees = flow_between(a, b)
     distance = _epipolar_distance(first.camera, second.camera, flow)
     gradient = np.hypot(cv2.Sobel(a, cv2.CV_32F, 1, 0), cv2.Sobel(a, cv2.CV_32F, 0, 1))
-    textured = (gradient > max(np.quantile(gradient, 0.6), 8.0)) & is_seen
+    textured = (gradient > max(np.quantile(gradient, 0.6), 8.0)) & is_there & is_seen
     if agrees[textured].sum() < MIN_AGREEING * textured.sum():
         return None
     textured &= agrees
     static = np.ones(a.shape, bool)
     if first.static_mask is not None:
-        mask = first.static_mask.numpy().astype(np.uint8)
-        static = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST_EXACT) > 0
+        mask = np.where(first.static_mask.numpy(), 255, 0).astype(np.uint8)
+        reduced = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.uint8)
+        static = seen_from(shown, reduced, first.camera.resized(*size))[0] > 127
     values = [distance[textured & region] for region in (static, ~static)]
     if len(values[0]) < MIN_PIXELS:
         return None
@@ -158,12 +161,10 @@ def _compare_regions(motions: Sequence[Motion]) -> _Regions | None:
     return _Regions(float((dynamic > static).mean()), *medians)
 
 
-def _turned_like(
-    camera: Camera, frame: Frame, size: tuple[int, int]
-) -> tuple[UInt8[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """A frame in grey as if its camera were turned like another one and had its lens; and where it shows anything."""
+def _seen_from(camera: Camera, frame: Frame) -> tuple[UInt8[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """A frame in grey as another camera would show it at its place; and where it shows anything."""
     reduced = size_within(frame.camera.size, COMPARED_SIDE)
-    turned, is_seen = seen_from(camera.resized(*size), grey_levels(frame, reduced), frame.camera.resized(*reduced))
+    turned, is_seen = seen_from(camera, grey_levels(frame, reduced), frame.camera.resized(*reduced))
     return even_contrast(turned), is_seen
 
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
+import torch
 
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.optical_flow import grey_levels
@@ -71,13 +72,16 @@ def turning_of(frames: Sequence[Frame]) -> tuple[Turning, Turning] | None:
 
 
 def _features(frame: Frame, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions [K, 2] and SIFT descriptors [K, 128] of an image's static region."""
+    """Positions [K, 2] without distortion and SIFT descriptors [K, 128] of an image's static region."""
     grey = grey_levels(frame, size)
     mask = None
     if frame.static_mask is not None:
         mask = cv2.resize(frame.static_mask.numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
     points, descriptors = cv2.SIFT.create(MAX_FEATURES).detectAndCompute(grey, mask)
-    return np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5, descriptors
+    positions = torch.tensor([point.pt for point in points], dtype=torch.float64).reshape(-1, 2) + 0.5
+    camera = frame.camera.resized(*size)
+    ideal, _, is_seen = camera.pinhole.place(camera.rays(positions))
+    return ideal[is_seen].numpy(), None if descriptors is None else descriptors[is_seen.numpy()]
 
 
 def _match(a: tuple[np.ndarray, np.ndarray | None], b: tuple[np.ndarray, np.ndarray | None]) -> Matches | None:

@@ -76,11 +76,11 @@ class Frame:
 
     Attributes:
         name: Id in the capture.
-        camera: Pinhole camera in scene units, with the frame's time in [0, 1].
+        camera: Camera in scene units, with the distortion of its lens and the frame's time in [0, 1].
         image: [H, W, 3] 8-bit RGB.
         static_mask: [H, W] true where the scene is static; None if the frame has no mask.
-        inverse_depth: [H, W] inverse depth up to a scale and an offset per frame, NaN where unknown; None if the frame
-            has no depth.
+        inverse_depth: [H, W] inverse of ``Camera.depths`` up to a scale and an offset per frame, NaN where unknown;
+            None if the frame has no depth.
         covisible: [H, W] true where masked metrics are computed (iPhone captures); None if the frame has no such mask.
         empty: [H, W] true where the image shows the capture's ``background`` alone; None if that is not known.
     """
@@ -153,8 +153,7 @@ class Capture:
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
 
     Raises:
-        ValueError: If there are no training frames, or a camera has the distortion of a lens: frames are used as
-            images of pinhole cameras everywhere.
+        ValueError: If there are no training frames.
     """
 
     name: str
@@ -181,8 +180,6 @@ class Capture:
     def __post_init__(self) -> None:
         if not self.train:
             raise ValueError(f"{self.name} has no frames to train on")
-        if distorted := [name for name, camera in self.cameras.items() if camera.distortion is not None]:
-            raise ValueError(f"{self.name} must have undistorted frames: the camera of {distorted[0]} has a distortion")
         self.train, self.val, self.notes = tuple(self.train), tuple(self.val), tuple(self.notes)
         self.assumption, self.has_empty = self.unmasked, self.background == "white"
         self._moved: frozenset[str] = frozenset()

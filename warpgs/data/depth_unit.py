@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -99,14 +100,16 @@ def _agreement(
     chosen = np.random.default_rng(0).permutation(len(rows))[:NUM_PIXELS]
     rows, columns = rows[chosen], columns[chosen]
     start, along = _line_of_sight(first, second, rows, columns, depths[0][rows, columns])
-    seen = start[:, None] + factors[:, None] * along[:, None]  # [3, S, N], in pixels times depth
-    in_front = seen[2] > 1e-12
-    pixels = seen[:2] / np.where(in_front, seen[2], 1.0)
+    seen = start[:, None] + factors[:, None] * along[:, None]  # [3, S, N]
+    pixels, depth, is_seen = (
+        part.numpy().T.reshape(*part.shape[1:], *seen.shape[1:])
+        for part in second.camera.place(torch.from_numpy(seen.reshape(3, -1).T))
+    )
     height, width = depths[1].shape
-    inside = in_front & (pixels[0] >= 0) & (pixels[0] < width) & (pixels[1] >= 0) & (pixels[1] < height)
+    inside = is_seen & (pixels[0] >= 0) & (pixels[0] < width) & (pixels[1] >= 0) & (pixels[1] < height)
     column, row = np.where(inside, pixels, 0.0).astype(int)
     with np.errstate(invalid="ignore"):
-        agrees = inside & (np.abs(seen[2] / (factors[:, None] * depths[1][row, column]) - 1.0) < TOLERANCE)
+        agrees = inside & (np.abs(depth / (factors[:, None] * depths[1][row, column]) - 1.0) < TOLERANCE)
     a, b = _grey(first)[rows, columns], _grey(second)[row, column]
     return np.array([_correlation(a[k], c[k]) * k.mean() for k, c in zip(agrees, b, strict=True)])
 
@@ -114,11 +117,11 @@ def _agreement(
 def _line_of_sight(
     first: Frame, second: Frame, rows: np.ndarray, columns: np.ndarray, depth: Float[np.ndarray, " N"]
 ) -> tuple[Float[np.ndarray, "3 1"], Float[np.ndarray, "3 N"]]:
-    """The second camera sees the pixels of the first at start + factor · along, in pixels times depth."""
-    (r1, k1), (r2, k2) = ((_double(c.viewmat[:3, :3]), _double(c.K)) for c in (first.camera, second.camera))
-    rays = np.linalg.inv(k1) @ np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    """The second camera sees the pixels of the first at start + factor · along, in its own axes."""
+    r1, r2 = (_double(frame.camera.viewmat[:3, :3]) for frame in (first, second))
+    rays = first.camera.rays(torch.from_numpy(np.stack([columns, rows], 1) + 0.5)).numpy()
     shift = _double(first.camera.position - second.camera.position)
-    return k2 @ r2 @ shift[:, None], k2 @ r2 @ r1.T @ (rays * depth)
+    return r2 @ shift[:, None], r2 @ r1.T @ (rays.T * depth)
 
 
 def _double(values: Tensor) -> np.ndarray:

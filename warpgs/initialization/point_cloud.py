@@ -163,8 +163,9 @@ def unproject(
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
     """Positions and colours of the pixels in the mask that have a finite depth."""
     row, column = (mask & depth.isfinite()).nonzero(as_tuple=True)
-    z = depth[row, column]
-    return camera.unproject(row, column, z), image[row, column]
+    points = camera.unproject(row, column, depth[row, column])
+    is_seen = points.isfinite().all(1)
+    return points[is_seen], image[row, column][is_seen]
 
 
 def filled(count: int, value: float) -> Float[Tensor, " P"]:

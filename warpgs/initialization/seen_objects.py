@@ -1,6 +1,5 @@
 """Dynamic objects as training frames see them: their size, and the static points around them."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
@@ -123,17 +122,17 @@ class ObjectView:
         self.time, self.size = camera.time, self._camera.size
         rows, columns = np.divmod(pixels, self._camera.width)
         self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
-        viewed = dataclasses.replace(self._camera, viewmat=torch.eye(4, dtype=torch.float32))
-        self._slopes = viewed.unproject(self._rows, self._columns, filled(len(pixels), 1.0))[:, :2].contiguous().numpy()
+        self._positions = torch.stack([self._columns, self._rows], 1) + 0.5
+        self._rays = self._camera.rays(self._positions).nan_to_num().numpy()
 
     def diameter(self) -> float:
         """Largest distance of two of its pixels at depth 1."""
-        hull = cv2.convexHull(self._slopes)[:, 0]
+        hull = self._rays[cv2.convexHull(self._positions.numpy(), returnPoints=False)[:, 0]]
         return float(np.linalg.norm(hull[:, None] - hull, axis=-1).max())
 
     def area(self) -> float:
         """Square root of its area at depth 1."""
-        return math.sqrt(len(self._rows) / float(self._camera.K[0, 0] * self._camera.K[1, 1]))
+        return math.sqrt(float(self._camera.pixel_areas(self._positions.double()).nansum()))
 
     def position(self, depth: float) -> Float[np.ndarray, "3"]:
         """Where its centre is at a depth, in scene units."""
@@ -142,7 +141,7 @@ class ObjectView:
 
     def surface(self, depth: float) -> Float[Tensor, " P"]:
         """Depth of its pixels if it is round, with that mean."""
-        points = depth * self._slopes
+        points = depth * self._rays
         nearer = front_of_ball(points - points.mean(0))
         return torch.from_numpy(depth + nearer.mean() - nearer).float()
 

@@ -1,9 +1,11 @@
 """The regions of what moves in images with transparent surroundings."""
 
+import math
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
 from warpgs.data.capture import Frame
@@ -58,14 +60,14 @@ def find_regions(views: Views) -> list[list[Region]]:
 def _regions(frame: Frame) -> list[Region]:
     assert frame.static_mask is not None
     camera, image = frame.camera, frame.image.numpy()
-    to_rays = np.linalg.inv(camera.K.double().numpy() @ camera.viewmat[:3, :3].double().numpy())
-    origin = camera.position.double().numpy()
+    origin, rotation = camera.position.double().numpy(), camera.viewmat[:3, :3].double().numpy()
     lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(float)
     regions = []
     for region in connected_regions(~frame.static_mask.numpy(), MIN_PIXELS):
         y, x = np.nonzero(region)
-        rays = _unit(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1) @ to_rays.T)
-        radius = float(np.sqrt(len(x) / (np.pi * float(camera.K[0, 0] * camera.K[1, 1]))))
+        positions = torch.from_numpy(np.stack([x, y], 1) + 0.5)
+        rays = _unit(camera.rays(positions).numpy() @ rotation)
+        radius = math.sqrt(float(camera.pixel_areas(positions).nansum()) / math.pi)
         kept = evenly_spaced_indices(len(x), MAX_PIXELS)
         colors = image[y[kept], x[kept]] / 255.0
         regions.append(Region(camera.time, origin, _unit(rays.mean(0)), radius, lab[y, x].mean(0), rays[kept], colors))

@@ -270,7 +270,9 @@ def _checked(capture: Capture, config: TrainConfig, log: Log) -> Capture:
         return capture
     ranks.require_same("the options", json.dumps(dataclasses.asdict(config), default=str).encode())
     cameras = [(name, camera.size, camera.time) for name, camera in sorted(capture.cameras.items())]
-    values = [capture.points, *(tensor for _, c in sorted(capture.cameras.items()) for tensor in (c.viewmat, c.K))]
+    values = [capture.points]
+    for _, camera in sorted(capture.cameras.items()):
+        values += [camera.viewmat, camera.K, *([camera.distortion.coefficients] if camera.distortion else [])]
     numbers = b"".join(tensor.cpu().numpy().tobytes() for tensor in values)
     ranks.require_same("the capture", repr((cameras, capture.train, capture.val)).encode() + numbers)
     return capture

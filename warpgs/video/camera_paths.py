@@ -154,7 +154,7 @@ def replay(capture: Capture, frames: int) -> list[Camera]:
     Seen from elsewhere, what moves would show sides at times at which no training frame shows them.
     """
     if jumps(capture):
-        return at_times(capture.cameras[middle_view(capture)], evenly_spaced(frames))
+        return at_times(capture.cameras[middle_view(capture)].pinhole, evenly_spaced(frames))
     return training_path(capture, frames)
 
 
@@ -172,10 +172,10 @@ def jumps(capture: Capture) -> bool:
 
 
 def _in_time(capture: Capture) -> list[Camera]:
-    """The training cameras in the order of their times, one for each time."""
+    """The training cameras in the order of their times, one for each time, as pinholes."""
     by_time: dict[float, Camera] = {}
     for name in capture.train:
-        by_time.setdefault(capture.cameras[name].time, capture.cameras[name])
+        by_time.setdefault(capture.cameras[name].time, capture.cameras[name].pinhole)
     return [by_time[time] for time in sorted(by_time)]
 
 
@@ -305,4 +305,4 @@ def filling(camera: Camera, size: tuple[int, int]) -> Camera:
     K = scaled.K.clone()
     K[0, 2] -= (scaled.width - width) // 2
     K[1, 2] -= (scaled.height - height) // 2
-    return Camera(camera.viewmat, K, width, height, camera.time)
+    return dataclasses.replace(camera, K=K, width=width, height=height)

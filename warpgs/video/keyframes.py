@@ -157,7 +157,7 @@ def _posed(name: str, value: dict[str, Any], capture: Capture, up: Tensor) -> Ca
         view = value["view"]
         if not isinstance(view, str) or view not in capture.cameras:
             raise ValueError(f"{name}: {missing_view(capture, view)}")
-        return capture.cameras[view]
+        return capture.cameras[view].pinhole
     if "viewmat" in value:
         return _from_matrices(name, value, first)
     position, target = (_vector(f"{name}: {end}", value[end]) for end in ("position", "target"))

@@ -143,7 +143,7 @@ def _start_view(options: Render, capture: Capture) -> Camera:
     name = options.view or camera_paths.middle_view(capture)
     if name not in capture.cameras:
         raise ValueError(missing_view(capture, name))
-    return capture.cameras[name]
+    return capture.cameras[name].pinhole
 
 
 def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.ndarray]) -> str:

@@ -1,6 +1,7 @@
 """Training views on the device."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
 from typing import NamedTuple
@@ -8,12 +9,14 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from warpgs.cache import cache_folder
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import resize_inverse
+from warpgs.distortion import Distortion
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
@@ -67,7 +70,8 @@ class Views:
         background: Colour behind everything.
         resident: Whether all views are on the device.
         cache: The file of those that are not resident, so that each is decoded once; None if all are.
-        uses_graphs: Whether work on the selected view is captured in CUDA graphs; only if all views are of one size.
+        uses_graphs: Whether work on the selected view is captured in CUDA graphs: only if all views have one size,
+            and lenses of one kind and limit, which are constants of a graph.
         index: [1] index of the selected view, on the device.
         mask_trust: [T] ``View.mask_trust`` of each view, at first 1; on the device.
         num_pixels: Number of pixels of all views.
@@ -90,6 +94,11 @@ class Views:
         cameras = [capture.cameras[name] for name in capture.train]
         self._viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device)
         self._Ks = torch.stack([camera.K for camera in cameras]).to(device)
+        self._lenses = [camera.distortion for camera in cameras]
+        coefficients = [torch.zeros(0) if lens is None else lens.coefficients.float() for lens in self._lenses]
+        self._coefficients = pad_sequence(coefficients, batch_first=True).to(device)
+        motions = [torch.zeros(2, 3, dtype=torch.float32) if c.motion is None else c.motion for c in cameras]
+        self._motions = None if all(c.motion is None for c in cameras) else torch.stack(motions).to(device)
         self._times = torch.tensor([[camera.time] for camera in cameras], dtype=torch.float32, device=device)
         self._gains: Float[Tensor, "T 3"] | None = None
         self._reader = ViewReader(capture, mask_margin, pinned=device.type == "cuda")
@@ -101,7 +110,8 @@ class Views:
         sizes = [camera.size for camera in cameras]
         self.num_pixels = sum(width * height for width, height in sizes)
         have_one_size = len(set(sizes)) == 1
-        self.uses_graphs = graph and have_one_size and device.type == "cuda"
+        have_one_lens = len({None if lens is None else (lens.lens, lens.limit) for lens in self._lenses}) == 1
+        self.uses_graphs = graph and have_one_size and have_one_lens and device.type == "cuda"
         bytes_per_pixel = BYTES_PER_PIXEL + (mask_margin > 0.0)
         self.resident = have_one_size and self.num_pixels * bytes_per_pixel <= resident_bytes
         self._reader.cache = self.cache = None if self.resident else ViewCache(cache_folder("decoded views"), sizes)
@@ -116,7 +126,7 @@ class Views:
 
     def __getitem__(self, index: int) -> View:
         on_device = self._pixels(index).map(lambda tensor: tensor.to(self.device))
-        return self._view(on_device, torch.full((1,), index, device=self.device))
+        return self._view(on_device, torch.full((1,), index, device=self.device), self._lenses[index])
 
     def _pixels(self, index: int) -> Pixels:
         """The pixels of a view, on the device if they are resident, else in host memory."""
@@ -176,14 +186,15 @@ class Views:
     def select(self, index: int) -> None:
         """Selects the view of an index, in the order of the current stream."""
         self.index.fill_(index)
+        self._lens = self._lenses[index]
         if not self.resident:
             self._slot.fill(self._read_ahead.take(index))
 
     def selected(self) -> View:
         """The selected view, read from addresses that stay the same if ``uses_graphs``."""
         if not self.resident:
-            return self._view(self._slot.pixels, self.index)
-        return self._view(self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index)
+            return self._view(self._slot.pixels, self.index, self._lens)
+        return self._view(self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index, self._lens)
 
     def divide_by(self, gains: Float[Tensor, "T 3"]) -> None:
         """Divides images by a factor per channel."""
@@ -237,15 +248,16 @@ class Views:
     def _corrected(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
         return camera if self.poses is None else self.poses.moved(camera, index)
 
-    def _view(self, pixels: Pixels, index: Int64[Tensor, "1"]) -> View:
-        """A view on the device."""
-        viewmat, K, time, mask_trust = (
-            values.index_select(0, index)[0] for values in (self._viewmats, self._Ks, self._times, self.mask_trust)
-        )
+    def _view(self, pixels: Pixels, index: Int64[Tensor, "1"], lens: Distortion | None) -> View:
+        """A view on the device; of its lens, the coefficients are read there."""
+        of_views = (self._viewmats, self._Ks, self._times, self.mask_trust, self._coefficients)
+        viewmat, K, time, mask_trust, k = (values.index_select(0, index)[0] for values in of_views)
+        distortion = None if lens is None else replace(lens, coefficients=k[: len(lens.coefficients)])
+        motion = None if self._motions is None else self._motions.index_select(0, index)[0]
         height, width = pixels.static_mask.shape
         image = pixels.image.float() / 255.0
         return View(
-            self._corrected(Camera(viewmat, K, width, height), index),
+            self._corrected(Camera(viewmat, K, width, height, distortion=distortion, motion=motion), index),
             time,
             image if self._gains is None else image / self._gains.index_select(0, index)[0],
             pixels.static_mask,

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -59,13 +60,14 @@ def seen_from(
     Returns:
         The image, and which of its pixels the given image has.
     """
-    to_pixels = [(c.K.double() @ c.viewmat[:3, :3].double()).cpu().numpy() for c in (taken, camera)]
-    corner = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])  # OpenCV has pixel centres at integers
-    mapping = np.linalg.inv(corner) @ to_pixels[0] @ np.linalg.inv(to_pixels[1]) @ corner
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    inside = cv2.warpPerspective(np.full(image.shape[:2], 255, np.uint8), mapping, camera.size, flags=flags)
-    shown = cv2.warpPerspective(image, mapping, camera.size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return shown.astype(np.uint8), inside > 127
+    camera, taken = camera.to("cpu"), taken.to("cpu")
+    viewed = camera.rays(camera.pixel_centers) @ camera.viewmat[:3, :3] @ taken.viewmat[:3, :3].T
+    positions, _, is_seen = taken.place(viewed)
+    is_seen &= ((positions >= 0.0) & (positions <= torch.tensor(taken.size))).all(1)
+    # OpenCV has pixel centres at integers.
+    maps = (positions - 0.5).clamp(-1.0, 2.0 * max(taken.size)).reshape(camera.height, camera.width, 2).numpy()
+    shown = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return shown.astype(np.uint8), is_seen.reshape(camera.height, camera.width).numpy()
 
 
 def comparison(truth: Float[Tensor, "H W 3"], rendering: Rendering) -> UInt8[np.ndarray, "H2 W5 3"]:
