@@ -1,5 +1,6 @@
 """A local server in place of the addresses of releases, an empty cache, and an empty folder to download to."""
 
+import signal
 from urllib.parse import urlsplit
 
 import pytest
@@ -15,7 +16,10 @@ from .server import Server, files_of, zipped
 @pytest.fixture
 def server():
     started = Server()
+    # A shell lets what it starts in the background ignore Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield started
+    signal.signal(signal.SIGINT, before)
     started.stop()
 
 

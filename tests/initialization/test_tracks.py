@@ -195,7 +195,7 @@ def test_splines_are_refused_where_nothing_is_tracked(tmp_path):
 @pytest.fixture
 def trainer(data, capture, tmp_path, monkeypatch):
     model = dataclasses.replace(tiny.MODEL, dynamic_points=500)
-    schedule = plain.schedule(stage1=20, stage2=10, densify_until=0, reset_every=1_000, prune_every=1_000)
+    schedule = plain.schedule(pretrain=0, stage1=20, stage2=10, densify_until=0, reset_every=1_000, prune_every=1_000)
     monkeypatch.setitem(FIXED_RATES, "logit_opacities", 0.3)
     config = dataclasses.replace(tiny.CONFIG, background="capture", model=model, schedule=schedule)
     return tiny.trainer(data, tmp_path / "run", config)
