@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from .lens_equirectangular import equirectangular_point
 from .lens_fisheye import fisheye_point
 from .lens_pinhole import pinhole_point
 from .lens_radial import radial_point
@@ -26,5 +27,6 @@ LENSES = {
     "pinhole": LensKernels(pinhole_point),
     "radial": LensKernels(radial_point),
     "fisheye": LensKernels(fisheye_point, is_wide=True),
+    "equirectangular": LensKernels(equirectangular_point, is_wide=True),
 }
 """Lenses by name."""

@@ -139,7 +139,7 @@ def make_project(lens: LensKernels, is_rolling: bool) -> wp.Function:
         depth = t[2]
         if wp.static(is_wide):
             depth = wp.length(t)
-            if not (t[2] > depth * wp.cos(limit)):
+            if not (t[2] >= depth * wp.cos(limit)):  # also right behind, if the limit is π
                 return splat
         if not (depth > near and wp.length_sq(t) < FAR * FAR and wp.length_sq(quats[i]) > 0.0):
             return splat

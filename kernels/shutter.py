@@ -120,7 +120,7 @@ def make_rolling_shutter(lens: LensKernels) -> wp.Function:
         depth = at_row[2]
         if wp.static(is_wide):
             distance = wp.length(at_row)
-            depth = wp.where(at_row[2] > distance * wp.cos(limit), distance, 0.0)
+            depth = wp.where(at_row[2] >= distance * wp.cos(limit), distance, 0.0)
         return point, shear * jacobian * rotation, depth
 
     return rolling_shutter

@@ -1,6 +1,7 @@
 """Renders and losses on the GPU equal those on the CPU."""
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -23,6 +24,7 @@ from tests.scenes import (
     weighted_sum,
 )
 from warpgs.bench.workloads import graphed, make_workload, parameter_names
+from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.distortion import Distortion
 from warpgs.kernels.constants import CULLED_DEPTH
@@ -90,6 +92,21 @@ def test_images_and_gradients_through_a_lens_equal_those_on_cpu(lens, coefficien
         image.square().sum().backward()
         trained = (values, motion) if is_rolling else (values,)
         return [t.detach().cpu() for t in (image, *(t.grad for t in trained), *gradients(splats).values())]
+
+    for actual, expected in zip(pull("cuda"), pull("cpu"), strict=True):
+        assert relative_error(actual, expected) < 1e-5
+
+
+@pytest.mark.parametrize("turn", [1.0, -1.0])  # the seam is behind or ahead
+def test_images_and_gradients_of_a_panorama_equal_those_on_cpu(turn):
+    def pull(device):
+        splats = as_leaves(make_splats(200).to(device))
+        K = torch.tensor([[96 / (2 * math.pi), 0.0, 48.0], [0.0, 48 / math.pi, 24.0], [0.0, 0.0, 1.0]])
+        viewmat = torch.diag(torch.tensor([turn, 1.0, turn, 1.0])) @ make_camera().viewmat
+        view = Camera(viewmat, K, 96, 48, distortion=Distortion.equirectangular()).to(device)
+        image = render(splats, view, settings=RenderSettings(depth=True, statistics=True)).joint.image
+        image.square().sum().backward()
+        return [t.detach().cpu() for t in (image, *gradients(splats).values())]
 
     for actual, expected in zip(pull("cuda"), pull("cpu"), strict=True):
         assert relative_error(actual, expected) < 1e-5

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import make_camera, make_splats, relative_error, select
+from tests.scenes import as_leaves, gradients, make_camera, make_splats, relative_error, select
 from warpgs import Camera, render
 from warpgs.distortion import Distortion
 from warpgs.rendering import RenderSettings
@@ -32,7 +32,11 @@ CAPTURED = {  # focal lengths, principal point, size and coefficients
     "one pixel": ("radial", (1, 1), (0.5, 0.5), (1, 1), [-0.1]),
     "200 degrees": ("fisheye", (440, 440), (640, 480), (1280, 960), [-0.01, 0.002, -0.002, 3e-4]),
 }
-LENSES = {"radial": Distortion.radial(RADIAL, K, SIZE), "fisheye": Distortion.fisheye(FISHEYE, K, SIZE)}
+LENSES = {
+    "radial": Distortion.radial(RADIAL, K, SIZE),
+    "fisheye": Distortion.fisheye(FISHEYE, K, SIZE),
+    "equirectangular": Distortion.equirectangular(),
+}
 
 
 def camera(lens):
@@ -95,7 +99,7 @@ def test_a_gaussian_appears_at_the_pixel_that_its_centre_is_projected_to(lens):
         assert rendered.depth[row, column] == pytest.approx(3.0, rel=1e-4)
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("lens", ["radial", "fisheye"])
 def test_the_coefficient_of_a_lens_is_found_from_its_image(lens):
     splats, view = make_splats(60), camera(lens)
     truth = torch.tensor(-0.15 if lens == "radial" else 0.1)
@@ -137,6 +141,74 @@ def test_a_fisheye_camera_renders_what_is_beside_and_behind_it():
         assert bool(view.project(point)[3])
 
 
+PANORAMA = Camera(
+    make_camera().viewmat,
+    torch.tensor([[64 / (2 * math.pi), 0.0, 32.0], [0.0, 32 / math.pi, 16.0], [0.0, 0.0, 1.0]]),
+    64,
+    32,
+    distortion=Distortion.equirectangular(),
+)
+MOTION = torch.tensor([[0.1, 0.3, 0.0], [0.4, 0.1, 0.2]])
+
+
+def turned_back(camera):
+    """A panorama's camera turned by 180 degrees to its right."""
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    motion = None if camera.motion is None else camera.motion @ turn[:3, :3]
+    return dataclasses.replace(camera, viewmat=turn @ camera.viewmat, motion=motion)
+
+
+def around(num=60):
+    """Splats in all directions around the camera, none of which reaches more than halfway around it."""
+    splats = make_splats(num)
+    splats = dataclasses.replace(splats, means=1.5 * splats.means - torch.tensor([0.0, 0.0, 5.0]))
+    return as_leaves(select(splats, PANORAMA.depths(splats.means) > 0.5))
+
+
+@pytest.mark.parametrize("motion", [None, MOTION])
+def test_a_panorama_has_no_seam(motion):
+    """What is in its middle, where splats are drawn once, is at its borders if the camera is turned back."""
+    settings = RenderSettings(depth=True, branches=True)
+    ahead = dataclasses.replace(PANORAMA, motion=motion)
+    splats = around()
+    layers = [render(splats, camera, settings=settings) for camera in (ahead, turned_back(ahead))]
+    for name in ("joint", "static", "dynamic"):
+        first, second = (getattr(layer, name) for layer in layers)
+        assert second.alpha[:, [0, -1]].max() > 0.3
+        for part in ("image", "alpha", "depth"):
+            turned = getattr(second, part).roll(32, 1)
+            torch.testing.assert_close(turned, getattr(first, part), rtol=1e-3, atol=1e-4)
+
+
+def test_gradients_across_the_seam_of_a_panorama_are_as_elsewhere():
+    found = []
+    for camera, columns in ((PANORAMA, 0), (turned_back(PANORAMA), 32)):
+        splats = around()
+        offsets = torch.zeros_like(splats.means[:, :2], requires_grad=True)
+        K, viewmat = (part.clone().requires_grad_() for part in (camera.K, camera.viewmat))
+        view = dataclasses.replace(camera, K=K, viewmat=viewmat)
+        image = render(splats, view, screen_offsets=offsets).joint.image.roll(columns, 1)
+        (image * torch.linspace(-1.0, 1.0, 32)[:, None, None]).square().sum().backward()
+        found.append([*gradients(splats).values(), offsets.grad, K.grad[1, 1], viewmat.grad[1]])
+    for first, second in zip(*found, strict=True):
+        assert relative_error(second, first) < 1e-3
+
+
+def test_statistics_of_a_panorama_are_of_each_splat_once():
+    splats, settings = around(), RenderSettings(statistics=True)
+    first, second = (render(splats, camera, settings=settings) for camera in (PANORAMA, turned_back(PANORAMA)))
+    assert first.radii.shape == (len(splats.means), 2)
+    assert torch.equal(first.contributed, second.contributed)
+    torch.testing.assert_close(first.weights, second.weights, rtol=1e-3, atol=1e-3)
+    assert torch.equal(first.contributed, first.weights > 0)
+
+
+def test_a_panorama_without_splats_is_empty():
+    rendering = render(make_splats(0), PANORAMA, settings=RenderSettings(statistics=True))
+    assert not rendering.joint.alpha.any()
+    assert rendering.radii.shape == (0, 2)
+
+
 @pytest.mark.parametrize(
     ("make", "coefficients", "message"),
     [
@@ -174,7 +246,7 @@ def test_a_fisheye_lens_sees_little_more_than_its_image_shows(focal, limit):
 @pytest.mark.parametrize(
     ("lens", "coefficients", "limit", "message"),
     [
-        ("fish", torch.zeros(4), 1.0, "lens must be radial or fisheye, got 'fish'"),
+        ("fish", torch.zeros(4), 1.0, "lens must be one of radial, fisheye, equirectangular, got 'fish'"),
         ("radial", torch.zeros(5), 1.0, r"coefficients must have shape \[12\]"),
         ("fisheye", torch.zeros(13), 1.0, r"coefficients must have shape \[4\]"),
         ("radial", torch.zeros(12, dtype=torch.float64), 1.0, "coefficients must be torch.float32"),

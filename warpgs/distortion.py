@@ -1,4 +1,4 @@
-"""Distortion: where a camera that is no pinhole puts a point. Formulas: kernels/lens_radial.py, lens_fisheye.py."""
+"""Distortion: where a camera that is no pinhole puts a point. Formulas: kernels/lens_*.py."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ from .runtime.checks import as_number, check_image_size, check_tensor, one_line_
 Coefficients = Sequence[float] | Shaped[Tensor, "..."] | Shaped[np.ndarray, "..."]
 """Coefficients of a lens, also as OpenCV returns them: [1, C] or [C, 1]."""
 
-NUM_COEFFICIENTS = {"radial": 12, "fisheye": 4}
+NUM_COEFFICIENTS = {"radial": 12, "fisheye": 4, "equirectangular": 0}
 
 MARGIN = 1.3
 """How far beyond the image's corners a radial lens follows its formula, relative to their distance from the axis, and a
@@ -56,24 +56,24 @@ class Distortion:
     """The distortion of a camera's lens.
 
     Attributes:
-        lens: "radial": OpenCV's coefficients k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4; or "fisheye": those of
-            cv2.fisheye, k1 to k4. Formulas: kernels/lens_radial.py, kernels/lens_fisheye.py.
-        coefficients: [12] or [4].
+        lens: "radial": OpenCV's coefficients k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4; "fisheye": those of
+            cv2.fisheye, k1 to k4; or "equirectangular", without any. Formulas: kernels/lens_*.py.
+        coefficients: [12], [4] or [0].
         limit: How far from the axis the formula holds: the radius on the plane z = 1 beyond which a radial lens
-            continues linearly, or the angle beyond which a fisheye lens sees nothing [radians].
+            continues linearly, or the angle beyond which other lenses see nothing [radians].
 
     Raises:
         ValueError: On an unknown lens, a wrong shape or dtype, or a limit that is not positive and finite, or for a
             fisheye above 178 degrees.
     """
 
-    lens: Literal["radial", "fisheye"]
+    lens: Literal["radial", "fisheye", "equirectangular"]
     coefficients: Float[Tensor, " C"]
     limit: float
 
     def __post_init__(self) -> None:
         if self.lens not in NUM_COEFFICIENTS:
-            raise ValueError(f"lens must be radial or fisheye, got {one_line_repr(self.lens)}")
+            raise ValueError(f"lens must be one of {', '.join(NUM_COEFFICIENTS)}, got {one_line_repr(self.lens)}")
         check_tensor("coefficients", self.coefficients, (NUM_COEFFICIENTS[self.lens],), {})
         limit = as_number("limit", self.limit)
         if not 0.0 < limit < math.inf or (self.lens == "fisheye" and limit > MAX_ANGLE):
@@ -121,6 +121,15 @@ class Distortion:
         at_corner, turns = _checked_profile(theta, bent, distances.norm().item(), k, distances.min().item())
         return Distortion("fisheye", k, min(max(MARGIN * at_corner, math.pi / 2), turns))
 
+    @staticmethod
+    def equirectangular() -> "Distortion":
+        """A panorama's: the middle of the image is forward, and columns are longitudes, rows latitudes, as in OpenSfM.
+
+        Focal lengths are pixels per radian: of a full image (width / 2π, height / π), with the principal point in its
+        middle. What is at the left and right border of 360 degrees is composited at both.
+        """
+        return Distortion("equirectangular", torch.zeros(0, dtype=torch.float32), math.pi)
+
     def to(self, device: torch.device | str) -> "Distortion":
         """A copy on another device."""
         return dataclasses.replace(self, coefficients=self.coefficients.to(device))
@@ -128,12 +137,12 @@ class Distortion:
     @property
     def measures_distance(self) -> bool:
         """Whether depth is the distance from the camera, because the lens may see behind it, instead of z."""
-        return self.lens == "fisheye"
+        return self.lens != "radial"
 
     def sees(self, viewed: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
         """Whether points in camera space are where the formula of the lens holds."""
-        if self.lens == "fisheye":
-            return torch.atan2(viewed[:, :2].norm(dim=1), viewed[:, 2]) < self.limit
+        if self.measures_distance:
+            return torch.atan2(viewed[:, :2].norm(dim=1), viewed[:, 2]) <= self.limit
         return (viewed[:, 2] > 0.0) & (viewed[:, :2].norm(dim=1) < self.limit * viewed[:, 2])
 
     def bend(self, viewed: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
@@ -142,13 +151,16 @@ class Distortion:
             rho = viewed[:, :2].norm(dim=1).clamp_min(TINY)
             bent = _bent_angle(torch.atan2(rho, viewed[:, 2]), self.coefficients.to(viewed))
             return viewed[:, :2] * (bent / rho)[:, None]
+        if self.lens == "equirectangular":
+            x, y, z = viewed.unbind(1)
+            return torch.stack([torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))], 1)
         return _radial(viewed[:, :2] / viewed[:, 2:], self.coefficients.to(viewed))
 
     @torch.no_grad()
     def rays(self, bent: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
         """[P, 3] rays that the lens bends to positions [focal lengths], NaN where it bends none that it sees.
 
-        They have z = 1, or, of a fisheye lens, are unit vectors. Computed in double precision, without gradients.
+        They have z = 1, or, where depth is distance, are unit vectors. Computed in double precision, without gradients.
         """
         k, position = self.coefficients.to(bent).double(), bent.double()
         if self.lens == "fisheye":
@@ -157,6 +169,10 @@ class Distortion:
             across = position * (theta.sin() / radius.clamp_min(TINY))[:, None]
             rays = torch.cat([across, theta.cos()[:, None]], 1)
             is_found = (_bent_angle(theta, k) - radius).abs() < MAX_RESIDUAL
+        elif self.lens == "equirectangular":
+            (sin_lon, sin_lat), (cos_lon, cos_lat) = position.sin().unbind(1), position.cos().unbind(1)
+            rays = torch.stack([cos_lat * sin_lon, sin_lat, cos_lat * cos_lon], 1)
+            is_found = (position.abs() < position.new_tensor([math.pi, math.pi / 2]) + MAX_RESIDUAL).all(1)
         else:
             slopes = _inverse_radial(position, k, self.limit)
             rays = torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1)

@@ -1,5 +1,6 @@
 """Differentiable rendering: splats, camera, background → images."""
 
+import dataclasses
 import threading
 from functools import partial
 from typing import Any, NamedTuple, TypeGuard
@@ -150,9 +151,50 @@ def render(
     if background is None and splats.num_channels == 3:
         background = splats.background
     _check_inputs(splats, camera, background, settings, screen_offsets)
+    if camera.distortion is not None and camera.distortion.lens == "equirectangular":
+        splats, screen_offsets = _twice(splats, camera, screen_offsets)
+        return _once(_rendered(splats, camera, screen_offsets, background, settings))
+    return _rendered(splats, camera, screen_offsets, background, settings)
+
+
+def _rendered(
+    splats: Splats, camera: Camera, screen_offsets: Tensor | None, background: Tensor | None, settings: RenderSettings
+) -> Rendering:
     inputs = _inputs(splats, camera, background, settings, screen_offsets)
     outputs = differentiable(partial(_forward, _request(splats, camera, settings)), *inputs)
     return _rendering(outputs, settings)
+
+
+def _twice(splats: Splats, camera: Camera, screen_offsets: Tensor | None) -> tuple[Splats, Float[Tensor, "M 2"]]:
+    """Splats and once more the same, 360 degrees away: there, those are seen that reach across a panorama's border.
+
+    Returns:
+        The 2 N splats, and the offsets of their means on screen.
+    """
+    tensors = {name: getattr(splats, name) for name in Splats.tensor_names()}
+    twice: dict[str, Any] = {
+        name: torch.cat([tensor, tensor]) for name, tensor in tensors.items() if tensor is not None
+    }
+    _, column, *_ = camera.project(splats.means.detach())
+    turn = 4.0 * torch.pi * camera.K[0, 0] / camera.width  # 360 degrees in halves of the width
+    shift = torch.where(column < camera.width / 2, turn, -turn)
+    offsets = torch.zeros_like(splats.means[:, :2]) if screen_offsets is None else screen_offsets
+    again = offsets + torch.stack([shift, torch.zeros_like(shift)], 1)
+    return dataclasses.replace(splats, **twice), torch.cat([offsets, again])
+
+
+def _once(rendering: Rendering) -> Rendering:
+    """The rendering of ``_twice`` with values of each of the splats."""
+
+    def of_both(values: Tensor) -> Tensor:
+        return values.unflatten(0, (2, len(values) // 2))
+
+    contributed, weights = rendering.contributed, rendering.weights
+    return rendering._replace(
+        radii=of_both(rendering.radii).amax(0),
+        contributed=None if contributed is None else of_both(contributed).any(0),
+        weights=None if weights is None else of_both(weights).sum(0),
+    )
 
 
 @torch.no_grad()

@@ -22,8 +22,10 @@ VIEWS = {
     "fisheye": View(torch.eye(4), K, *SIZE, FISHEYE, math.radians(110.0), "fisheye"),
 }
 K_WIDE = torch.tensor([[9.0, 0.0, 25.0], [0.0, 8.0, 18.0], [0.0, 0.0, 1.0]])
-CASES = {**VIEWS, "wide": VIEWS["fisheye"]._replace(K=K_WIDE)}
-"""The last one has nearly all that it sees in its image."""
+K_PANORAMA = torch.tensor([[50.0 / (2 * math.pi), 0.0, 25.0], [0.0, 37.0 / math.pi, 18.5], [0.0, 0.0, 1.0]])
+PANORAMA = View(torch.eye(4), K_PANORAMA, *SIZE, torch.zeros(0), math.pi, "equirectangular")
+CASES = {**VIEWS, "wide": VIEWS["fisheye"]._replace(K=K_WIDE), "panorama": PANORAMA}
+"""The last two have nearly all that they see in their image."""
 
 
 def gaussians(points: torch.Tensor, size: float = 0.05) -> Geometry:
@@ -36,7 +38,7 @@ def gaussians(points: torch.Tensor, size: float = 0.05) -> Geometry:
 def scattered(view: View, num: int = 60) -> Geometry:
     """Gaussians in all directions around the axis up to what the lens sees, on it, and nearly on it."""
     random = generator(3)
-    farthest = 0.99 * view.limit if view.lens == "fisheye" else math.atan(1.3 * view.limit)
+    farthest = 0.99 * view.limit if view.lens != "radial" else math.atan(1.3 * view.limit)
     theta = farthest * torch.rand(num, generator=random)
     theta[:3] = torch.tensor([0.0, 1e-4, 0.0999])
     turn = 2 * math.pi * torch.rand(num, generator=random)
@@ -56,6 +58,30 @@ def test_points_are_where_opencv_puts_them(lens):
     pose, coefficients = np.zeros(3), view.distortion.double().numpy()
     expected = project_points(points[:, None].double().numpy(), pose, pose, K.double().numpy(), coefficients)[0]
     assert relative_error(project(gaussians(points), view).means2d, torch.tensor(expected[:, 0])) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("direction", "longitude", "latitude"),
+    [
+        ((0.0, 0.0, 1.0), 0.0, 0.0),
+        ((1.0, 0.0, 0.0), 90.0, 0.0),
+        ((1.0, 0.0, -1.0), 135.0, 0.0),
+        ((-1e-4, 0.0, -1.0), -179.994, 0.0),
+        ((0.0, 1.0, 1.0), 0.0, 45.0),
+        ((-1.0, -math.sqrt(2.0), 1.0), -45.0, -45.0),
+    ],
+)
+def test_a_panorama_has_longitudes_to_the_right_and_latitudes_downward(direction, longitude, latitude):
+    splats = project(gaussians(3.0 * torch.tensor([direction])), PANORAMA)
+    expected = torch.tensor([[25.0 + longitude * 50.0 / 360.0, 18.5 + latitude * 37.0 / 180.0]])
+    torch.testing.assert_close(splats.means2d, expected, rtol=1e-5, atol=1e-4)
+    assert splats.depths.item() == pytest.approx(3.0 * torch.tensor(direction).norm().item())
+
+
+@pytest.mark.parametrize("height", [-2.0, 2.0])
+def test_a_panorama_culls_what_is_right_above_or_below_the_camera(height):
+    points = torch.tensor([[0.0, height, 0.0], [0.05, height, 0.05]])
+    assert project(gaussians(points, 0.01), PANORAMA).radii.gt(0).all(1).tolist() == [False, True]
 
 
 def test_lenses_without_distortion_project_as_pinhole_and_equidistant():

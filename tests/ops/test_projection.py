@@ -62,7 +62,8 @@ def gradients(tensors, view, v_rows, antialias=False):
 
 def assert_same_gradients(tensors, view, v_rows, antialias, of_camera=False):
     """Compares the backward pass with that of the reference in double precision; returns what is visible."""
-    names = [name for name in ("viewmat", "K", "distortion", "motion") if getattr(view, name) is not None]
+    given = {name: getattr(view, name) for name in ("viewmat", "K", "distortion", "motion")}
+    names = [name for name, part in given.items() if part is not None and part.numel()]
     parts = {name: getattr(view, name).clone().requires_grad_(of_camera) for name in names}
     v = gradients(tensors, view._replace(**parts), v_rows, antialias)
 

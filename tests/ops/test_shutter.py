@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.ops.alone import project
-from tests.ops.test_lenses import VIEWS, gaussians, scattered
+from tests.ops.test_lenses import PANORAMA, VIEWS, gaussians, scattered
 from tests.ops.test_projection import assert_same_gradients, gradients, inputs, random_gradient_rows
 from tests.reference import lenses, shutter
 from tests.reference import rows as rows_reference
@@ -18,7 +18,10 @@ from warpgs.ops.projection import Geometry, View
 CAMERA = make_camera()
 MOTION = torch.tensor([[0.12, -0.18, 0.08], [0.25, 0.15, -0.12]])
 PINHOLE = View(CAMERA.viewmat, CAMERA.K, *CAMERA.size, motion=MOTION)
-CASES = {"pinhole": PINHOLE, **{lens: view._replace(motion=MOTION) for lens, view in VIEWS.items()}}
+CASES = {
+    "pinhole": PINHOLE,
+    **{lens: view._replace(motion=MOTION) for lens, view in {**VIEWS, "panorama": PANORAMA}.items()},
+}
 
 
 def case(lens):

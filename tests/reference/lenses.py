@@ -1,5 +1,7 @@
 """Lenses in plain torch, any dtype: their formulas as printed, with Jacobians by automatic differentiation."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -29,6 +31,12 @@ def fisheye(t: Tensor, k: Tensor) -> Tensor:
     return t[:, :2] * (bent / rho)[:, None]
 
 
+def equirectangular(t: Tensor, k: Tensor) -> Tensor:
+    """[N, 2] longitude and latitude of a panorama, x to the right and y downward (OpenSfM's, without coefficients)."""
+    x, y, z = t.unbind(-1)
+    return torch.stack([torch.atan2(x, z), torch.asin(y / t.norm(dim=1))], -1)
+
+
 def _jacobian(function, points: Tensor) -> Tensor:
     """[N, 2, D] derivatives of a function of [N, D] points, each of which decides its own value."""
     with torch.enable_grad():
@@ -41,9 +49,9 @@ def _jacobian(function, points: Tensor) -> Tensor:
 def point_and_jacobian(t: Tensor, view: View) -> tuple[Tensor, Tensor]:
     """[N, 2] points of the image and [N, 2, 3] the Jacobian of the local affine approximation."""
     focal, center = view.K.diagonal()[:2], view.K[:2, 2]
-    if view.lens == "fisheye":
-        jacobian = _jacobian(lambda t: fisheye(t, view.distortion), t)
-        return focal * fisheye(t, view.distortion) + center, focal[:, None] * jacobian
+    if view.lens in (wide := {"fisheye": fisheye, "equirectangular": equirectangular}):
+        function = partial(wide[view.lens], k=view.distortion)
+        return focal * function(t) + center, focal[:, None] * _jacobian(function, t)
     z, slopes = t[:, 2], t[:, :2] / t[:, 2:]
     if view.lens == "pinhole":
         size = torch.tensor([view.width, view.height], dtype=t.dtype)

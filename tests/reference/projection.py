@@ -19,7 +19,7 @@ class Projection(NamedTuple):
     Attributes:
         means2d: [N, 2] centres [px].
         conics: [N, 3] entries xx, xy, yy of the inverse 2D covariance [1/px²].
-        depths: [N] z in camera space, for a fisheye lens the distance from the camera, at the row of a rolling
+        depths: [N] z in camera space, for a wide lens the distance from the camera, at the row of a rolling
             shutter [scene units].
         opacities: [N] in [0, 1], with antialiasing compensated for the low-pass filter.
         radii: [N, 2] int32 half sizes on screen [px]; 0 = culled.
@@ -63,8 +63,8 @@ def project(
 
 
 def depth_and_visibility(t: Tensor, view: View, near: float) -> tuple[Tensor, Tensor]:
-    """[N] depths, the distance from a fisheye camera, and whether the lens sees them at all."""
-    if view.lens != "fisheye":
+    """[N] depths, the distance from a camera with a wide lens, and whether the lens sees them at all."""
+    if view.lens not in ("fisheye", "equirectangular"):
         return t[:, 2], t[:, 2] > near
     distance = t.norm(dim=1)
     return distance, (distance > near) & (torch.acos(t[:, 2] / distance) < view.limit)
