@@ -20,11 +20,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from warpgs.data import writer
-from warpgs.data.images import decode, read_image, read_mask
-from warpgs.data.lens import Lens, filling_zoom, undistort
+from warpgs.data.images import decode, read_mask
 from warpgs.files import write_png
 from warpgs.prepare.frames.images import resize_to_side
 from warpgs.prepare.scene import FACTORS
@@ -44,9 +42,6 @@ MIN_TRAIN = 3
 
 MAX_DIFFERENCE = 0.5
 """Mean difference above which a frame is not the one that an image of the capture was made from [grey levels]."""
-
-MAX_SHIFT, NUM_SHIFTS = 0.3, 121
-"""Range of the distortion at the corner of the image, relative to its distance from the centre, and steps within it."""
 
 
 def evenly(count: int, num_train: int | None) -> list[int]:
@@ -71,43 +66,15 @@ def prepare(folder: Path, frames: list[Path], root: Path, num_train: int | None)
     subprocess.run([sys.executable, "-m", "warpgs", "prepare", str(folder), str(root), *options], check=True)
 
 
-def recorded_lens(root: Path, pairs: dict[str, Path]) -> Lens:
-    """The lens of the frames that a capture was made from, which it does not keep.
-
-    Images of the capture are undistorted. The distortion is the one that makes them from their frames again.
-
-    Args:
-        root: The capture.
-        pairs: Frames by the ids of their images.
-
-    Raises:
-        ValueError: If no distortion does: these are other frames.
-    """
-    camera = json.loads((root / f"camera/{next(iter(pairs))}.json").read_text())
-    (width, height), focal = camera["image_size"], camera["focal_length"]
-    center = (camera["principal_point"][0], camera["principal_point"][1])
-    images = {path: read_image(root / f"rgb/1x/{name}.png", (width, height)) for name, path in pairs.items()}
-    frames = {path: resize_to_side(cv2.imread(str(path))[..., ::-1], max(width, height), 1.0) for path in images}
-    corner = np.hypot(width, height) / (2.0 * focal)
-
-    def lens_of(shift: float) -> Lens:
-        zoom = 1.0  # the focal length of the image is that of the frame times the zoom, which depends on it
-        for _ in range(10):
-            lens = Lens(width, height, (focal / zoom, focal / zoom), center, (float(shift / corner**2), 0.0, 0.0))
-            zoom = filling_zoom(lens)
-        return lens
-
-    def difference(shift: float) -> float:
-        lens = lens_of(shift)
-        return max(float(cv2.absdiff(undistort(frames[path], lens), images[path]).mean()) for path in images)
-
-    shifts = np.linspace(-MAX_SHIFT, MAX_SHIFT, NUM_SHIFTS)
-    nearest, step = min(shifts, key=difference), shifts[1] - shifts[0]
-    bounds = nearest - step, nearest + step
-    found = minimize_scalar(difference, bounds=bounds, method="bounded", options={"xatol": 1e-7})
-    if found.fun > MAX_DIFFERENCE:
-        raise ValueError(f"{root} was not made from {', '.join(map(str, pairs.values()))}")
-    return lens_of(float(found.x))
+def require_made_from(root: Path, pairs: dict[str, Path]) -> tuple[int, int]:
+    """Raises ValueError unless images of a capture, by their ids, are these frames; returns their (width, height)."""
+    for name, path in pairs.items():
+        image = cv2.imread(str(root / f"rgb/1x/{name}.png"))
+        height, width = image.shape[:2]
+        frame = resize_to_side(cv2.imread(str(path)), max(width, height), 1.0)
+        if frame.shape != image.shape or cv2.absdiff(frame, image).mean() > MAX_DIFFERENCE:
+            raise ValueError(f"{root} was not made from {', '.join(map(str, pairs.values()))}")
+    return width, height
 
 
 def place_annotations(root: Path, frames: list[Path], folder: Path) -> None:
@@ -126,12 +93,11 @@ def place_annotations(root: Path, frames: list[Path], folder: Path) -> None:
     if steps[-1] >= len(frames):
         raise ValueError(f"{root} was made from more than {len(frames)} frames")
     source = {name: frames[step] for name, step in zip(ids, steps, strict=True)}
-    lens = recorded_lens(root, {name: source[name] for name in (ids[0], ids[len(ids) // 2], ids[-1])})
+    size = require_made_from(root, {name: source[name] for name in (ids[0], ids[len(ids) // 2], ids[-1])})
     for name in ids:
         annotated = decode(folder / f"{source[name].stem}.png", cv2.IMREAD_GRAYSCALE)
         covered = np.where(annotated > 0, 255, 0).astype(np.uint8)
-        covered = cv2.resize(covered, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-        static = undistort(covered < 128, lens)
+        static = cv2.resize(covered, size, interpolation=cv2.INTER_AREA) < 128
         write_png(root / f"annotation/1x/{name}.png", static.astype(np.uint8) * 255)
         if name in index["val_ids"]:
             writer.write_mask(root, name, static, FACTORS)

@@ -34,7 +34,7 @@ config = partial(
     replace(
         PAPER,
         preset=None,
-        undistort=True,
+        distortion=True,
         max_alpha=0.999,
         model=model(),
         loss=loss(),

@@ -166,7 +166,7 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         ),
         (
             ["train", "--resume", "r", "--seed", "1"],
-            "warpgs train: --resume takes all but --data, --device, --iterations, --lpips and --as-taken from",
+            "warpgs train: --resume takes all but --data, --device, --iterations and --lpips from",
         ),
         (
             ["train", "--resume", "r", "--lpips-net", "alex"],

@@ -3,7 +3,6 @@
 import runpy
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,13 +11,13 @@ import pytest
 
 from warpgs.data import writer
 from warpgs.data.images import read_mask
-from warpgs.data.lens import Lens, pinhole_matrix, undistort
+from warpgs.data.lens import Lens
 from warpgs.data.units import SceneUnits
 from warpgs.files import read_json, write_json
 
 SCRIPT = Path(__file__).parent.parent / "examples" / "development_set.py"
 WIDTH, HEIGHT, NUM_FRAMES = 120, 80, 13
-LENS = Lens(WIDTH, HEIGHT, (100.0, 100.0), (60.0, 40.0), (0.15, 0.0, 0.0))
+LENS = Lens(WIDTH, HEIGHT, (100.0, 100.0), (60.0, 40.0), (0.15,))
 
 
 def annotation(step: int) -> np.ndarray:
@@ -28,9 +27,9 @@ def annotation(step: int) -> np.ndarray:
     return inside
 
 
-def undistorted_annotation(step: int) -> np.ndarray:
+def covered(step: int) -> np.ndarray:
     """True where the object is in the image of the capture."""
-    return undistort(annotation(step)[::2, ::2] > 0, LENS)
+    return annotation(step)[::2, ::2] > 0
 
 
 @pytest.fixture
@@ -48,16 +47,14 @@ def davis(tmp_path):
 
 def prepared(frames: list[Path], root: Path, holdout: int) -> None:
     """A capture of frames through ``LENS``; its masks have the upper half of the object."""
-    K = pinhole_matrix(LENS)
-    pinhole = replace(LENS, focal=(K[0, 0], K[1, 1]), radial=(0.0, 0.0, 0.0))
     for k, path in enumerate(frames):
         name, image = f"frame_{k:06d}", cv2.imread(str(path))[..., ::-1]
         image = cv2.resize(image, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
-        dynamic = undistorted_annotation(int(path.stem))
+        dynamic = covered(int(path.stem))
         dynamic[HEIGHT // 2 :] = False
-        writer.write_image(root, name, undistort(image, LENS), (1, 2))
+        writer.write_image(root, name, image, (1, 2))
         writer.write_mask(root, name, ~dynamic, (1, 2))
-        writer.write_camera(root, name, pinhole, np.eye(3), np.array([0.1 * k, 0.0, 0.0]))
+        writer.write_camera(root, name, LENS, np.eye(3), np.array([0.1 * k, 0.0, 0.0]))
     names = [f"frame_{k:06d}" for k in range(len(frames))]
     points = np.random.default_rng(1).uniform([-2, -1, 4], [2, 1, 6], (60, 3))
     writer.write_scene(root, SceneUnits(np.zeros(3), 0.2), points, 0.1, 2.0)
@@ -101,14 +98,13 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
-def test_masks_of_evaluation_frames_become_the_undistorted_annotations(make):
+def test_masks_of_evaluation_frames_become_the_annotations(make):
     root, _ = make()
     val = read_json(root / "dataset.json")["val_ids"]
     assert val == ["frame_000004", "frame_000012"]
     for name in val:
-        expected = undistorted_annotation(int(name[6:]))
+        expected = covered(int(name[6:]))
         assert overlap(mask(root, name), expected) > 0.99
-        assert overlap(mask(root, name), annotation(int(name[6:]))[::2, ::2] > 0) < 0.95  # the distortion matters
         coarse = expected.reshape(HEIGHT // 2, 2, WIDTH // 2, 2).any((1, 3))
         assert overlap(mask(root, name, factor=2), coarse) > 0.98
 
@@ -117,13 +113,13 @@ def test_training_frames_keep_their_masks_and_get_annotations_next_to_them(make)
     root, _ = make()
     for name in read_json(root / "dataset.json")["train_ids"]:
         annotated = ~read_mask(root / f"annotation/1x/{name}.png", (WIDTH, HEIGHT))
-        assert overlap(annotated, undistorted_annotation(int(name[6:]))) > 0.99
+        assert overlap(annotated, covered(int(name[6:]))) > 0.99
         assert not mask(root, name)[HEIGHT // 2 :].any()
 
 
 def test_masks_of_training_frames_are_scored(make):
     root, printed = make()
-    truths = [undistorted_annotation(step) for step in sources(root, "train_ids")]
+    truths = [covered(step) for step in sources(root, "train_ids")]
     expected = np.mean([truth[: HEIGHT // 2].sum() / truth.sum() for truth in truths])
     frames, recall, iou, bad = printed.splitlines()[1].split()[1:]
     assert (int(frames), bad) == (len(truths), f"{np.mean([t[:40].sum() / t.sum() < 0.5 for t in truths]):.0%}")
@@ -135,7 +131,7 @@ def test_a_sparse_capture_has_evenly_spaced_training_frames_and_held_out_ones_ha
     root, _ = make("--count", "4")
     assert sources(root, "train_ids") == [0, 4, 8, 12]
     assert sources(root, "val_ids") == [2, 6, 10]
-    assert overlap(mask(root, "frame_000003"), undistorted_annotation(6)) > 0.99
+    assert overlap(mask(root, "frame_000003"), covered(6)) > 0.99
 
 
 def test_a_clip_that_was_prepared_is_not_prepared_again(make, monkeypatch):

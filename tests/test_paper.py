@@ -76,7 +76,7 @@ PAPER = {
     },
     "3DGS: rasterization": {"max_alpha": 0.99, "background": "capture"},
     "3DGS, Deformable-3DGS and the code of the authors: initial Gaussians": {"model.start": "plain"},
-    "Deformable-3DGS: cameras and frames as they are, factor of HyperNeRF's vrig captures": {"undistort": False},
+    "Deformable-3DGS: cameras and frames as they are, factor of HyperNeRF's vrig captures": {"distortion": False},
     "3DGS: depth regularization": {"loss.depth": 1.0, "loss.depth_end": 0.01},
     "code of the authors": {"model.dynamic_points": 100_000, "model.tracks": False},
     "no such thing in the paper": {
@@ -105,7 +105,7 @@ PAPER = {
 """Every option of the method, by the section of the paper, or of the code that it builds upon, that sets it."""
 
 RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
-RUN |= {"lpips_net", "as_taken"}
+RUN |= {"lpips_net"}
 RUN |= {"damage_masks", "checkpoint_every", "resident_bytes"}
 """Options of a run that do not belong to the method."""
 

@@ -315,3 +315,21 @@ def test_the_index_is_complete(tmp_path):
     metadata = json.loads((tmp_path / "copy/metadata.json").read_text())
     assert metadata["00007_cam02"] == {"time_id": 7, "warp_id": 7, "appearance_id": 7, "camera_id": 1}
     assert metadata["frame_00007"]["camera_id"] == 0
+
+
+@pytest.mark.parametrize(
+    "fields", [{"k1": -0.2, "p1": 0.01}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.01}]
+)
+def test_frames_stay_as_recorded_with_their_lens_and_depth(tmp_path, fields):
+    source = layouts.write_nerfstudio(tmp_path / "source")
+    captures.edit_json(source / "transforms.json", **fields)
+    import_capture(source, tmp_path / "copy")
+    before, after = load_capture(source), load_capture(tmp_path / "copy")
+    name = before.train[1]
+    a, b = before.frame(name), after.frame(name)
+    assert torch.equal(a.image, b.image)
+    assert torch.allclose(a.camera.K, b.camera.K)
+    assert a.camera.distortion.lens == b.camera.distortion.lens
+    assert torch.allclose(a.camera.distortion.coefficients, b.camera.distortion.coefficients)
+    known = a.inverse_depth.isfinite()
+    assert torch.allclose(a.inverse_depth[known], b.inverse_depth[known], rtol=2e-3)

@@ -62,7 +62,7 @@ DAMAGES = [
     ("colmap", lambda r: (r / "sparse/0/images.bin").unlink(), "is not a COLMAP model"),
     ("colmap", lambda r: (r / CAMERAS).write_bytes(FIELD_OF_VIEW), "FOV is not supported; first"),
     ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(99, [])), r"cameras\.bin is damaged"),
-    ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(4, BENT)), "too strong"),
+    ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(4, BENT)), "folds back inside the image"),
     ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [-5.0, 1, 1])), "focal lengths"),
     ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [np.nan, 1, 1])), "out of range"),
     ("colmap", lambda r: (r / CAMERAS).write_bytes(cameras_bin(0, [5.0, 1, 1], (10**9, 5))), "out of range"),

@@ -17,7 +17,7 @@ from warpgs.captures.opening import load_capture
 from warpgs.config import MaskPerturbation
 from warpgs.data.colmap import lens_of
 from warpgs.data.images import is_transparent
-from warpgs.data.lens import Lens, undistort
+from warpgs.data.lens import Lens
 from warpgs.data.loaders import blender, recognize
 from warpgs.data.loaders.posed import plain_names
 
@@ -267,34 +267,44 @@ def test_images_are_averaged_and_masks_keep_what_moves_where_they_are_reduced(wr
     assert np.array_equal(~frame.static_mask.numpy(), dynamic)
 
 
-def test_distorted_nerfstudio_images_are_undistorted(edited):
+def test_images_of_nerfstudio_are_read_as_they_are_with_the_distortion_of_their_lens(edited):
     root = edited("nerfstudio")
     layouts.edit_transforms(root / "transforms.json", k1=0.6)
     capture = load_capture(root)
     bent = layouts.NAMES[-1]  # frames are listed in reverse
-    assert capture.cameras[bent].K[0, 0] > layouts.FOCAL
-    assert capture.cameras[layouts.NAMES[1]].K[0, 0] == layouts.FOCAL
+    assert Lens.of(capture.cameras[bent]).coefficients == pytest.approx((0.6,))
+    assert capture.cameras[layouts.NAMES[1]].distortion is None
+    assert {float(camera.K[0, 0]) for camera in capture.cameras.values()} == {layouts.FOCAL}
+    assert np.array_equal(capture.frame(bent).image.numpy(), layouts.image(INDEX[bent]))
 
 
 @pytest.mark.parametrize("fields", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
-def test_fisheye_images_of_nerfstudio_are_undistorted(edited, fields):
+def test_fisheye_images_of_nerfstudio_are_read_as_they_are(edited, fields):
     root = edited("nerfstudio")
     edit_json(root / "transforms.json", **fields, k1=0.1, k4=0.01)
+    frame = load_capture(root).frame(layouts.NAMES[2])
+    lens = Lens.of(frame.camera)
+    assert lens.model == "fisheye"
+    assert lens.coefficients == pytest.approx((0.1, 0.0, 0.0, 0.01))
+    assert np.array_equal(frame.image.numpy(), layouts.image(2))
+
+
+@pytest.mark.parametrize("fields", [{"k1": -0.3, "k2": 0.05}, {"camera_model": "OPENCV_FISHEYE", "k1": 0.1}])
+def test_points_of_depth_are_where_a_lens_sees_them(edited, fields):
+    root = edited("nerfstudio")
+    edit_json(root / "transforms.json", ply_file_path=None, **fields)
     capture = load_capture(root)
-    (fx, fy), size = (layouts.FOCAL, layouts.FOCAL), layouts.SIZE
-    lens = Lens(*size, (fx, fy), layouts.CENTER, fisheye=(0.1, 0.0, 0.0, 0.01))
-    name = layouts.NAMES[2]
-    assert np.array_equal(capture.frame(name).image.numpy(), undistort(layouts.image(2), lens))
-    assert not np.array_equal(capture.frame(name).image.numpy(), layouts.image(2))
-    with pytest.raises(ValueError, match=f"frame {name} was taken by a fisheye lens: it can only be evaluated undist"):
-        capture.read_taken(name)
+    first = capture.frame(capture.in_time(capture.cameras)[0])
+    row, column, depth, inside = first.camera.project(capture.points)
+    error = (first.inverse_depth[row, column] * depth - 1.0).abs()[inside]
+    assert (error < 1e-5).sum() > 50  # those that were taken from its own pixels
 
 
 @LAYOUTS
-def test_without_undistortion_cameras_look_at_the_centre_of_the_image(written, layout):
-    capture, undistorted = load_capture(written[layout], undistort=False), load_capture(written[layout])
+def test_without_distortion_cameras_look_at_the_centre_of_the_image(written, layout):
+    capture, bent = load_capture(written[layout], distortion=False), load_capture(written[layout])
     name = capture.train[1]
-    frame, other = capture.frame(name), undistorted.frame(name)
+    frame, other = capture.frame(name), bent.frame(name)
     expected = [[layouts.FOCAL, 0, layouts.SIZE[0] / 2], [0, layouts.FOCAL, layouts.SIZE[1] / 2], [0, 0, 1]]
     assert torch.allclose(frame.camera.K, torch.tensor(expected, dtype=torch.float32), atol=1e-4)
     assert torch.equal(frame.camera.viewmat, other.camera.viewmat)
@@ -305,16 +315,15 @@ def test_without_undistortion_cameras_look_at_the_centre_of_the_image(written, l
     "fields",
     [
         {"k1": 0.6, "p1": 0.02},
-        {"k1": -50.0},  # too strong to undistort, as is the last one
+        {"k1": -50.0},  # folds back, as does the last one
         {"camera_model": "OPENCV_FISHEYE", "k1": 0.1},
         {"camera_model": "OPENCV_FISHEYE", "k1": -3.0},
     ],
 )
-def test_without_undistortion_frames_of_nerfstudio_are_those_of_the_files(edited, written, fields):
+def test_without_distortion_frames_of_nerfstudio_are_those_of_the_files(edited, written, fields):
     root = edited("nerfstudio")
     edit_json(root / "transforms.json", **fields)
-    capture, plain = load_capture(root, undistort=False), load_capture(written["nerfstudio"])
-    assert capture.read_taken is None
+    capture, plain = load_capture(root, distortion=False), load_capture(written["nerfstudio"])
     for name in layouts.NAMES:
         frame, expected = capture.frame(name), plain.frame(name)
         assert np.array_equal(frame.image.numpy(), layouts.image(INDEX[name]))
@@ -324,12 +333,12 @@ def test_without_undistortion_frames_of_nerfstudio_are_those_of_the_files(edited
         assert frame.camera.K[:2, 2].tolist() == [layouts.SIZE[0] / 2, layouts.SIZE[1] / 2]
 
 
-def test_without_undistortion_points_of_depth_are_those_of_pinhole_cameras(edited, tmp_path):
+def test_without_distortion_points_of_depth_are_those_of_pinhole_cameras(edited, tmp_path):
     plain = edited("nerfstudio")
     edit_json(plain / "transforms.json", ply_file_path=None)
     bent = shutil.copytree(plain, tmp_path / "bent")
     edit_json(bent / "transforms.json", k1=-50.0)
-    points = load_capture(bent, undistort=False).points
+    points = load_capture(bent, distortion=False).points
     assert len(points) > 100
     assert torch.equal(points, load_capture(plain).points)
 
@@ -343,24 +352,30 @@ def test_without_undistortion_points_of_depth_are_those_of_pinhole_cameras(edite
         ("llff", "sparse/0/cameras.bin"),
     ],
 )
-def test_without_undistortion_no_distortion_is_too_strong(edited, layout, path):
+def test_without_distortion_no_lens_folds_back(edited, layout, path):
     root = edited(layout)
     if path.endswith(".json"):
         edit_json(root / path, k1=-50.0)
     else:
         (root / "sparse/0").mkdir(parents=True, exist_ok=True)
         layouts.write_binary_model(root / "sparse/0", [*layouts.PARAMS[:4], -50.0, 0.0, 0.0, 0.0])
-    capture = load_capture(root, layout, undistort=False)
+    capture = load_capture(root, layout, distortion=False)
     assert capture.cameras[capture.val[0]].K[0, 0].item() == pytest.approx(layouts.FOCAL)
     assert len(capture.frame(capture.val[0]).image)
 
 
 @pytest.mark.parametrize(
     ("model", "bent"),
-    [("OPENCV_FISHEYE", (0.1, 0.02, 0.03, 0.01)), ("RADIAL_FISHEYE", (0.1, 0.02)), ("SIMPLE_RADIAL_FISHEYE", (0.1,))],
+    [
+        ("OPENCV", (0.1, 0.02, 0.003, 0.001)),
+        ("FULL_OPENCV", (0.1, 0.02, 0.003, 0.001, 0.01, 0.05, 0.02, 0.01)),
+        ("OPENCV_FISHEYE", (0.1, 0.02, 0.03, 0.01)),
+        ("RADIAL_FISHEYE", (0.1, 0.02)),
+        ("SIMPLE_RADIAL_FISHEYE", (0.1,)),
+    ],
 )
-def test_fisheye_models_of_colmap_project_as_colmap_does(model, bent):
-    focals = (50.0, 52.0) if model == "OPENCV_FISHEYE" else (50.0,)
+def test_models_of_colmap_project_as_colmap_does(model, bent):
+    focals = (50.0, 52.0) if "OPENCV" in model else (50.0,)
     camera = pycolmap.Camera(model=model, width=80, height=60, params=[*focals, 41.0, 29.0, *bent])
     points = np.random.default_rng(0).uniform(-1.5, 1.5, (30, 2))
     theirs = camera.img_from_cam(np.concatenate([points, np.ones((30, 1))], 1))

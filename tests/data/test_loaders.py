@@ -20,6 +20,7 @@ from warpgs.config import MaskPerturbation
 from warpgs.config.presets import PRESETS
 from warpgs.data import loaders
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.lens import Lens
 from warpgs.data.loaders import LOADERS, LoadOptions, recognize
 
 DATASETS = pytest.mark.parametrize("dataset", ["nerfds", "hypernerf", "iphone"])
@@ -126,8 +127,7 @@ def test_odd_sizes_are_rounded_as_in_nerfies(hypernerf):
 def test_old_camera_files_may_call_the_tangential_distortion_tangential(root):
     path = root / "camera/left_000000.json"
     edit_json(path, tangential_distortion=None, tangential=[0.02, 0.01])
-    scene = load_capture(root)
-    assert not np.array_equal(scene.frame("left_000000").image.numpy(), image_of("left_000000"))
+    assert Lens.of(load_capture(root).cameras["left_000000"]).coefficients == pytest.approx((0.0, 0.0, 0.02, 0.01))
 
 
 def test_a_third_tangential_coefficient_may_be_zero(root):
@@ -135,19 +135,60 @@ def test_a_third_tangential_coefficient_may_be_zero(root):
     assert len(load_capture(root).train) == 4
 
 
-def test_images_and_masks_of_a_distorted_frame_are_undistorted(root):
-    edit_json(root / "camera/left_000000.json", radial_distortion=[0.8, 0.0, 0.0])
+@pytest.mark.parametrize(
+    ("fields", "model", "coefficients"),
+    [
+        ({"radial_distortion": [0.3, 0.1, 0.02]}, "radial", (0.3, 0.1, 0.0, 0.0, 0.02)),
+        ({"rational_distortion": [0.1, 0.02, 0.03]}, "radial", (*[0.0] * 5, 0.1, 0.02, 0.03)),
+        ({"prism_distortion": [0.01, 0.0, 0.02, 0.0]}, "radial", (*[0.0] * 8, 0.01, 0.0, 0.02)),
+        ({"fisheye_distortion": [0.1, 0.0, 0.01, 0.0]}, "fisheye", (0.1, 0.0, 0.01)),
+        ({"fisheye_distortion": [0.0] * 4}, "fisheye", ()),
+    ],
+)
+def test_frames_are_as_recorded_and_cameras_have_the_distortion_of_their_lens(root, fields, model, coefficients):
+    edit_json(root / "camera/left_000000.json", **fields)
     scene = load_capture(root)
-    distorted, pinhole = scene.frame("left_000000"), scene.frame("left_000001")
-    assert distorted.camera.K[0, 0] > pinhole.camera.K[0, 0]
-    assert torch.equal(distorted.camera.K[:2, 2], pinhole.camera.K[:2, 2])
-    assert distorted.static_mask.dtype == torch.bool
-    assert not torch.equal(distorted.static_mask, pinhole.static_mask)
+    frame, pinhole = scene.frame("left_000000"), scene.frame("left_000001")
+    found = Lens.of(frame.camera)
+    assert found.model == model
+    assert found.coefficients == pytest.approx(coefficients)
+    assert torch.equal(frame.camera.K, pinhole.camera.K)
+    assert pinhole.camera.distortion is None
+    assert np.array_equal(frame.image.numpy(), image_of("left_000000"))
+    assert torch.equal(frame.static_mask, pinhole.static_mask)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"radial_distortion": [-500.0, 0.0, 0.0]}, "the lens folds back inside the image"),
+        ({"fisheye_distortion": [-3.0, 0.0, 0.0, 0.0]}, "the lens folds back inside the image"),
+        ({"radial_distortion": [float("nan"), 0.0, 0.0]}, "radial_distortion"),
+        (
+            {"fisheye_distortion": [0.1], "radial_distortion": [0.1]},
+            "a fisheye_distortion cannot have",
+        ),
+    ],
+)
+def test_a_lens_that_cannot_be_used_is_refused_with_its_file(root, fields, message):
+    edit_json(root / "camera/left_000000.json", **fields)
+    with pytest.raises(ValueError, match=f"camera/left_000000.json.*{message}"):
+        load_capture(root)
+
+
+def test_depth_of_a_fisheye_capture_is_the_distance(root):
+    captures.write_array(root / "depth/1x/left_000000.npy", np.full(SIZE[::-1], 0.5))
+    edit_json(root / "camera/left_000000.json", fisheye_distortion=[0.1, 0.0, 0.0, 0.0])
+    frame = load_capture(root).frame("left_000000")
+    row, column = torch.tensor([3, 20]), torch.tensor([2, 30])
+    points = frame.camera.unproject(row, column, 1.0 / frame.inverse_depth[row, column])
+    along_axis = (points - frame.camera.position) @ frame.camera.viewmat[2, :3]
+    assert along_axis.tolist() == pytest.approx([2.0, 2.0], rel=1e-4)
 
 
 @pytest.mark.parametrize("k1", [0.8, -500.0])
 @DATASETS
-def test_without_undistortion_frames_are_those_of_the_files_and_cameras_look_at_their_centre(tmp_path, dataset, k1):
+def test_without_distortion_cameras_are_pinholes_that_look_at_their_centre(tmp_path, dataset, k1):
     plain, bent = (write_capture(tmp_path / name, dataset) for name in ("plain", "bent"))
     for path in (bent / "camera").iterdir():
         edit_json(path, radial_distortion=[k1, 0.1, 0.0], tangential_distortion=[0.02, 0.01])
@@ -156,14 +197,9 @@ def test_without_undistortion_frames_are_those_of_the_files_and_cameras_look_at_
         for root in (plain, bent):
             captures.write_array(root / "depth/1x/left_000000.npy", depth)
     factor = captures.FACTORS[dataset]
-    capture, expected = load_capture(bent, factor=factor, undistort=False), load_capture(plain)
-    assert capture.read_taken is None
-    if k1 > 0:
-        assert load_capture(bent).read_taken is not None
-    else:
-        with pytest.raises(ValueError, match="too strong to undistort"):
-            load_capture(bent)
+    capture, expected = load_capture(bent, factor=factor, distortion=False), load_capture(plain)
     for name, camera in capture.cameras.items():
+        assert camera.distortion is None
         width, height = camera.size
         K = [[50.0 / factor, 0, width / 2], [0, 50.0 / factor, height / 2], [0, 0, 1]]
         assert torch.equal(camera.K, torch.tensor(K, dtype=torch.float32))
@@ -188,16 +224,16 @@ def test_only_depth_of_a_sensor_is_metric(iphone, tmp_path):
 def test_captures_of_two_cameras_have_a_factor_of_their_own_as_in_the_preset_paper(hypernerf):
     for path in (hypernerf / "rgb/2x").iterdir():
         captures.write_png(hypernerf / "rgb/4x" / path.name, image_of(path.stem, (SIZE[0] // 4, SIZE[1] // 4)))
-    sizes = [load_capture(hypernerf, undistort=undistort).cameras["left_000000"].width for undistort in (True, False)]
+    sizes = [load_capture(hypernerf, distortion=bends).cameras["left_000000"].width for bends in (True, False)]
     assert sizes == [SIZE[0] // 2, SIZE[0] // 4]
-    assert load_capture(hypernerf, factor=2, undistort=False).cameras["left_000000"].width == SIZE[0] // 2
+    assert load_capture(hypernerf, factor=2, distortion=False).cameras["left_000000"].width == SIZE[0] // 2
     config = dataclasses.replace(PRESETS["paper"], data=hypernerf)
     assert open_capture(config).cameras["left_000000"].width == SIZE[0] // 4
 
 
 def test_captures_of_one_camera_keep_the_factor_of_the_dataset(hypernerf):
     edit_json(hypernerf / "dataset.json", val_ids=[])
-    assert load_capture(hypernerf, undistort=False).cameras["left_000000"].width == SIZE[0] // 2
+    assert load_capture(hypernerf, distortion=False).cameras["left_000000"].width == SIZE[0] // 2
 
 
 def test_iphone_depth_is_unknown_where_the_sensor_has_no_value_or_a_clamped_one(iphone):
@@ -264,17 +300,6 @@ def test_without_a_points_file_points_and_colours_of_a_colmap_model_are_read(roo
 def test_a_single_time_is_0(root):
     edit_json(root / "dataset.json", train_ids=["left_000000"], val_ids=["right_000000"])
     assert [camera.time for camera in load_capture(root).cameras.values()] == [0.0, 0.0]
-
-
-def test_an_undistorted_image_agrees_with_opencv(root):
-    """If no zoom is needed, OpenCV's own undistortion gives the same image, with its pixel centres."""
-    name, k1 = "left_000000", -0.4
-    edit_json(root / f"camera/{name}.json", radial_distortion=[k1, 0.0, 0.0])
-    frame = load_capture(root).frame(name)
-    K = frame.camera.K.double().numpy()
-    K[:2, 2] -= 0.5
-    theirs = cv2.undistort(image_of(name), K, np.array([k1, 0.0, 0.0, 0.0, 0.0]))
-    assert np.abs(frame.image.numpy().astype(int) - theirs).max() <= 12  # OpenCV rounds positions to 1/32 pixel
 
 
 def test_interpolation_captures_train_on_every_fourth_frame_and_evaluate_halfway(hypernerf):
@@ -365,7 +390,7 @@ def test_a_dataset_is_added_by_one_entry(tmp_path, monkeypatch):
     assert recognize(tmp_path) == "text"
     assert load_capture(tmp_path).name == "mine"
     assert loader.options == LoadOptions()
-    options = {"factor": 3, "perturbation": MaskPerturbation(erode=1), "cache_frames": 7, "undistort": False}
+    options = {"factor": 3, "perturbation": MaskPerturbation(erode=1), "cache_frames": 7, "distortion": False}
     load_capture(tmp_path, "text", **options)
     assert loader.options == LoadOptions(**options)
 

@@ -8,7 +8,6 @@ import torch
 
 from tests.data import captures, layouts
 from warpgs.captures.opening import load_capture
-from warpgs.data.loaders import LoadOptions, load_with
 from warpgs.data.resized import reduced_capture
 
 
@@ -53,16 +52,6 @@ def test_captures_that_were_changed_are_pickled_as_they_are(data):
     dynamic = capture.assuming("dynamic").with_cameras(moved).split(capture.train[:2], capture.val[:1])
     for changed in (dynamic, reduced_capture(capture, 16), capture.over((0.1, 0.2, 0.3))):
         assert_the_same(pickle.loads(pickle.dumps(changed)), changed)
-
-
-def test_a_capture_with_lens_distortion_is_pickled_with_its_frames_as_they_were_taken(tmp_path):
-    root = captures.write_capture(tmp_path / "source", "hypernerf")
-    for path in (root / "camera").iterdir():
-        captures.edit_json(path, radial_distortion=[0.05, 0.0, 0.0])
-    capture = load_with(root, None, LoadOptions())
-    copy = pickle.loads(pickle.dumps(capture))
-    name = capture.train[0]
-    assert torch.equal(copy.read_taken(name).positions, capture.read_taken(name).positions)
 
 
 def test_a_copy_of_a_capture_shares_its_cache_of_frames(data):

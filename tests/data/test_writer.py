@@ -69,11 +69,25 @@ def test_cameras_are_read_back(root):
     assert np.allclose(camera.position.numpy(), (POSITION - UNITS.center) * UNITS.scale)
 
 
-def test_distortion_is_written(root):
-    bent = Lens(*SIZE, (20.0, 20.0), (6.0, 4.0), (0.1, 0.2, 0.3), (0.4, 0.5))
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("radial", (0.1, 0.02, 0.04, 0.05, 0.03)),
+        ("radial", (0.1, 0.02, 0.04, 0.05, 0.03, 0.01, 0.02, 0.03, 0.001, 0.002, 0.003, 0.004)),
+        ("fisheye", (0.1, 0.02, 0.03, 0.04)),
+        ("fisheye", ()),
+    ],
+)
+def test_distortion_is_read_back(root, model, coefficients):
+    bent = Lens(*SIZE, (20.0, 20.0), (6.0, 4.0), coefficients, model)
     writer.write_camera(root, "a", bent, ROTATION, POSITION)
-    written = json.loads((root / "camera/a.json").read_text())
-    assert (written["radial_distortion"], written["tangential_distortion"]) == ([0.1, 0.2, 0.3], [0.4, 0.5])
+    found = Lens.of(load_capture(root).cameras["a"])
+    assert found.model == model
+    assert found.coefficients == pytest.approx(coefficients)
+    if len(coefficients) == 5:
+        written = json.loads((root / "camera/a.json").read_text())
+        assert (written["radial_distortion"], written["tangential_distortion"]) == ([0.1, 0.02, 0.03], [0.04, 0.05])
+        assert not {"rational_distortion", "prism_distortion", "fisheye_distortion"} & set(written)
 
 
 def test_frames_are_split_and_ordered_by_time(root):

@@ -21,11 +21,9 @@ import torch
 from tests import tiny
 from tests.data.captures import write_png
 from tests.scenes import along_z
-from warpgs.cameras import Camera
 from warpgs.captures.opening import load_capture, open_capture
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.lens import Lens, pinhole_matrix, undistort
-from warpgs.data.taken import taken_frame
+from warpgs.data.lens import Lens
 from warpgs.evaluation import evaluate, evaluate_run, scene_metrics
 from warpgs.evaluation.evaluate import Evaluation, ViewMetrics
 from warpgs.evaluation.lpips import Lpips
@@ -196,7 +194,7 @@ def test_lpips_is_measured_with_the_network_that_is_given():
     assert result.views[1].values["masked_lpips"] == pytest.approx((error[:, :5].mean() / 2).item())
 
 
-LENS = Lens(60, 44, (62.0, 58.0), (31.3, 20.6), (-0.14, 0.05, 0.0), (0.006, -0.004))
+LENS = Lens(60, 44, (62.0, 58.0), (31.3, 20.6), (-0.14, 0.05, 0.006, -0.004))
 
 
 def pattern(x, y):
@@ -205,13 +203,7 @@ def pattern(x, y):
     return 0.5 + 0.4 * torch.stack(waves, 2)
 
 
-def rays(camera):
-    rows, columns = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    x = (columns - camera.K[0, 2]) / camera.K[0, 0] + camera.viewmat[0, 3]
-    return x, (rows - camera.K[1, 2]) / camera.K[1, 1]
-
-
-def undistorted_ray(u, v):
+def ray_at(u, v):
     """The x, y on the plane z = 1 whose image is a pixel of ``LENS``, by the solver of SciPy."""
     start = [(u - LENS.center[0]) / LENS.focal[0], (v - LENS.center[1]) / LENS.focal[1]]
     found = scipy.optimize.root(lambda p: LENS.image(np.array(p[0]), np.array(p[1])) - [u, v], start)
@@ -222,54 +214,26 @@ def undistorted_ray(u, v):
 @functools.cache
 def distorted_capture():
     """One evaluation frame of the pattern through ``LENS``."""
-    pixels = [[undistorted_ray(j + 0.5, i + 0.5) for j in range(LENS.width)] for i in range(LENS.height)]
+    pixels = [[ray_at(j + 0.5, i + 0.5) for j in range(LENS.width)] for i in range(LENS.height)]
     x, y = torch.tensor(np.array(pixels), dtype=torch.float32).unbind(2)
-    raw = (pattern(x, y) * 255).round().byte()
-    K = torch.tensor(pinhole_matrix(LENS), dtype=torch.float32)
-    camera = Camera(torch.eye(4), K, LENS.width, LENS.height, 0.5)
-    everywhere = torch.ones(LENS.height, LENS.width, dtype=torch.bool)
-    seen = Frame("a", camera, torch.from_numpy(undistort(raw.numpy(), LENS)), everywhere)
-    taken = taken_frame(Frame("a", camera, raw, everywhere), LENS)
-    read = {"a": seen}.__getitem__
-    return Capture("here", {"a": camera}, ["a"], ["a"], torch.zeros(0, 3), None, read, read_taken=lambda name: taken)
+    camera, everywhere = LENS.camera(np.eye(3), np.zeros(3), 0.5), torch.ones(x.shape, dtype=torch.bool)
+    frames = {"a": Frame("a", camera, (pattern(x, y) * 255).round().byte(), everywhere)}
+    return Capture("here", {"a": camera}, ["a"], ["a"], torch.zeros(0, 3), None, frames.__getitem__)
 
 
-def pattern_scene():
-    return Scene(lambda camera, branches: rendering(pattern(*rays(camera))))
+def pattern_through(camera, branches):
+    x, y, _ = camera.rays(camera.pixel_centers).reshape(camera.height, camera.width, 3).unbind(2)
+    return rendering(pattern(x, y))
 
 
-def test_frames_are_compared_as_they_were_taken_without_resampling_them():
-    """What is left is the rounding to 8 bits (58.9 dB) and the interpolation of the rendering."""
-    shown, options = [], {"quiet": True, "as_taken": True}
-    result = evaluate.evaluate(pattern_scene(), distorted_capture(), on_view=lambda *v: shown.append(v), **options)
-    assert result.views[0].values["psnr"] > 52.0
-    assert result.summary()["frames"] == "as taken"
-    _, _, truth, distorted = shown[0]
-    assert torch.equal(truth, distorted_capture().read_taken("a").frame.image.float() / 255)
-    assert truth.shape == distorted.joint.image.shape == distorted.static.image.shape == (LENS.height, LENS.width, 3)
-    assert distorted.dynamic.alpha.shape == truth.shape[:2]
-
-
-def test_by_default_frames_are_undistorted_first_and_the_metrics_say_so():
-    here, shown = distorted_capture(), []
-    result = evaluate.evaluate(pattern_scene(), here, on_view=lambda *view: shown.append(view), quiet=True)
-    assert result.summary()["frames"] == "undistorted"
-    assert torch.equal(shown[0][2], here.frame("a").image.float() / 255)
-    assert evaluated(capture(), noisy(capture())).summary()["frames"] == "as taken"
-
-
-def test_a_frame_as_it_was_taken_is_rendered_from_the_aligned_camera():
-    def moved(frame):
-        viewmat = frame.camera.viewmat.clone()
-        viewmat[0, 3] = 0.01
-        return dataclasses.replace(frame.camera, viewmat=viewmat)
-
-    options = {"quiet": True, "as_taken": True}
-    aligned = evaluate.evaluate(pattern_scene(), distorted_capture(), align=moved, **options)
-    assert (
-        aligned.views[0].values["psnr"]
-        < evaluate.evaluate(pattern_scene(), distorted_capture(), **options).views[0].values["psnr"] - 10
+def test_frames_are_compared_as_they_were_recorded():
+    """What is left is the rounding to 8 bits."""
+    shown = []
+    result = evaluate.evaluate(
+        Scene(pattern_through), distorted_capture(), on_view=lambda *v: shown.append(v), quiet=True
     )
+    assert result.views[0].values["psnr"] > 58.0
+    assert torch.equal(shown[0][2], distorted_capture().frame("a").image.float() / 255)
 
 
 def test_the_check_of_the_views_keeps_none_in_memory():
@@ -287,16 +251,6 @@ def test_the_check_of_the_views_shows_progress_unless_quiet(monkeypatch, quiet):
     monkeypatch.setattr(evaluate, "progress", lambda items, label, quiet: shown.append((label, quiet)) or items)
     evaluate.check_views(capture(), quiet=quiet)
     assert shown == [("reading evaluation frames", quiet)]
-
-
-def test_the_check_of_the_views_finds_a_lens_without_frames_as_they_were_taken():
-    def read_taken(name):
-        raise ValueError(f"frame {name} was taken by a fisheye lens")
-
-    here = dataclasses.replace(distorted_capture(), read_taken=read_taken)
-    evaluate.check_views(here)
-    with pytest.raises(ValueError, match="frame a was taken by a fisheye lens"):
-        evaluate.check_views(here, as_taken=True)
 
 
 def gray(value):

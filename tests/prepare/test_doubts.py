@@ -50,7 +50,7 @@ def test_a_focal_length_that_few_lenses_have_is_doubtful(factor, noted):
 
 
 def test_a_wide_fisheye_lens_is_not_doubtful():
-    lens = dataclasses.replace(boards.lens(), focal=(0.3 * boards.SIZE[0],) * 2, fisheye=(0.0, 0.0, 0.0, 0.0))
+    lens = dataclasses.replace(boards.lens(), focal=(0.3 * boards.SIZE[0],) * 2, model="fisheye")
     assert doubts_of_lens(Cameras(["a"], lens, boards.poses(2)[:1], boards.points(), 0.1, 10.0)) == []
 
 

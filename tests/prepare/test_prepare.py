@@ -15,7 +15,7 @@ from tests.campaign.damage import replace_by_fifo
 from tests.prepare import boards
 from warpgs.captures.check import check_capture
 from warpgs.captures.opening import load_capture
-from warpgs.data.lens import Lens, undistort
+from warpgs.data.lens import Lens
 from warpgs.prepare import pipeline
 from warpgs.prepare.cameras.recovered import Cameras, NoCamerasError
 from warpgs.prepare.cameras.sphere import points_around
@@ -299,23 +299,25 @@ def test_given_masks_are_used_unchanged(shots, tmp_path):
 
 
 @pytest.mark.parametrize("ending", [".png", ".png.png"])
-def test_masks_of_undistorted_frames_are_not_undistorted_again(ending, shots, tmp_path, monkeypatch):
-    distorted = dataclasses.replace(boards.lens(), radial=(-0.2, 0.0, 0.0))
+@pytest.mark.parametrize("pattern", ["shot{:03d}", "frame_{:06d}"])
+def test_given_masks_and_frames_stay_as_they_are_with_the_lens_that_was_found(
+    ending, pattern, shots, tmp_path, monkeypatch
+):
+    distorted = dataclasses.replace(boards.lens(), coefficients=(-0.2,))
 
     def recover(folder, names, *rest):
         return dataclasses.replace(boards.true_cameras(folder, names), lens=distorted)
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
     mask = boards.record(24)[1][10]
-    for pattern, expected in (("shot{:03d}", undistort(mask, distorted)), ("frame_{:06d}", mask)):
-        folder = tmp_path / pattern[:4]
-        folder.mkdir()
-        for k in range(24):
-            cv2.imwrite(str(folder / (pattern.format(k) + ending)), np.where(mask, 0, 255).astype(np.uint8))
-        prepare(shots, tmp_path / pattern[:3], masks=str(folder), depth="none")
-        capture = load_capture(tmp_path / pattern[:3])
-        assert np.array_equal(~capture.frame("frame_000010").static_mask.numpy(), expected)
-    assert (mask != undistort(mask, distorted)).sum() > 100
+    (tmp_path / "masks").mkdir()
+    for k in range(24):
+        cv2.imwrite(str(tmp_path / "masks" / (pattern.format(k) + ending)), np.where(mask, 0, 255).astype(np.uint8))
+    prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"), depth="none")
+    frame = load_capture(tmp_path / "made").frame("frame_000010")
+    assert np.array_equal(~frame.static_mask.numpy(), mask)
+    assert np.array_equal(frame.image.numpy(), cv2.imread(str(sorted(shots.iterdir())[10]))[..., ::-1])
+    assert Lens.of(frame.camera).coefficients == pytest.approx((-0.2,))
 
 
 def test_masks_of_another_aspect_ratio_are_refused_and_smaller_ones_enlarged(tmp_path):

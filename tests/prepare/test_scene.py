@@ -1,5 +1,6 @@
 """The files of a capture, and its scene units."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,8 +10,8 @@ from tests.prepare import boards
 from warpgs.captures.opening import load_capture
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import recognize
-from warpgs.prepare.cameras.recovered import Cameras, pinhole_lens
-from warpgs.prepare.scene import scene_units, static_points
+from warpgs.prepare.cameras.recovered import Cameras
+from warpgs.prepare.scene import scene_units, static_points, write_frames, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -70,12 +71,21 @@ def test_a_crowd_of_points_at_one_place_does_not_enlarge_the_scene():
     assert scene_units(crowded, points[:5]).scale == pytest.approx(expected, rel=0.01)
 
 
-def test_a_pinhole_lens_is_unchanged_and_a_distorted_one_zooms_in():
-    lens = Lens(64, 48, (50.0, 50.0), (32.0, 24.0))
-    assert pinhole_lens(lens) == lens
-    distorted = Lens(64, 48, (50.0, 50.0), (32.0, 24.0), (0.1, 0.0, 0.0))
-    assert pinhole_lens(distorted).focal[0] >= 50.0
-    assert pinhole_lens(distorted).is_pinhole
+@pytest.mark.parametrize("model", ["radial", "fisheye"])
+def test_frames_and_masks_are_written_as_they_were_recorded_with_their_lens(model, tmp_path):
+    images, masks = boards.record(16)
+    frames = boards.write_folder(tmp_path / "frames", images)
+    names = [path.stem for path in sorted(frames.iterdir())]
+    cameras = boards.true_cameras(frames, names)
+    lens = dataclasses.replace(cameras.lens, coefficients=(0.05, -0.01), model=model)
+    write_frames(tmp_path / "made", frames, dataclasses.replace(cameras, lens=lens), masks)
+    write_scene(tmp_path / "made", cameras, {name: k for k, name in enumerate(names)}, 4)
+    frame = load_capture(tmp_path / "made").frame(names[3])
+    assert np.array_equal(frame.image.numpy(), images[3])
+    assert np.array_equal(~frame.static_mask.numpy(), masks[3])
+    found = Lens.of(frame.camera)
+    assert (found.focal, found.model) == (pytest.approx(lens.focal), model)
+    assert found.coefficients == pytest.approx((0.05, -0.01))
 
 
 def test_points_in_dynamic_regions_are_omitted():

@@ -198,7 +198,7 @@ def test_the_better_metric_is_marked(tmp_path, run, other):
 
 
 def test_settings_that_differ_are_listed(run, other):
-    edit_json(other / "config.json", seed=7, as_taken=True)
+    edit_json(other / "config.json", seed=7, lpips_net="alex")
     runs = read_runs([run, other])
     assert config_rows([evaluated.config for evaluated in runs]) == [("seed", ["0", "7"])]
 

@@ -282,7 +282,7 @@ def test_an_unknown_built_in_capture_is_refused_before_anything_is_trained(tmp_p
 def test_cells_that_are_evaluated_in_another_way_are_trained_by_the_same_command(tmp_path):
     commands = [
         plan(spec(), out=tmp_path, **options)[0].command
-        for options in ({}, {"lpips": str(tmp_path / "my weights"), "lpips_net": "alex"}, {"as_taken": True})
+        for options in ({}, {"lpips": str(tmp_path / "my weights"), "lpips_net": "alex"}, {"lpips_net": "alex"})
     ]
     assert len(set(commands)) == 3
     assert all(parse_evaluation(command)[1] == shlex.split(commands[0]) for command in commands)
@@ -294,29 +294,24 @@ def test_a_cell_keeps_how_it_was_evaluated_before_unless_told_otherwise(tmp_path
     before = {"lpips": str(tmp_path / "weights"), "lpips_net": "alex"}
     [measured] = plan(spec(), out=tmp_path, **before)
     for options, expected in (
-        ({"as_taken": True}, (tmp_path / "weights", "alex", True)),
-        ({"lpips_net": "vgg"}, (tmp_path / "weights", "vgg", False)),
-        ({"lpips": str(tmp_path / "others")}, (tmp_path / "others", "alex", False)),
+        ({"lpips_net": "vgg"}, (tmp_path / "weights", "vgg")),
+        ({"lpips": str(tmp_path / "others")}, (tmp_path / "others", "alex")),
     ):
         [cell] = plan(spec(), out=tmp_path, **options)
         config = as_evaluated_before(cell, measured.command, options).config
-        assert (config.lpips, config.lpips_net, config.as_taken) == expected
+        assert (config.lpips, config.lpips_net) == expected
     [cell] = plan(spec(), out=tmp_path)
     assert as_evaluated_before(cell, "", {}) == cell
-    [taken] = plan(spec(), out=tmp_path, as_taken=True)
-    assert as_evaluated_before(cell, taken.command, {}) == taken
+    assert as_evaluated_before(cell, measured.command, {}) == measured
 
 
 @pytest.mark.parametrize(
     ("options", "metrics", "expected"),
     [
-        ({}, {"lpips_net": None, "frames": "undistorted"}, True),
+        ({}, {"lpips_net": None}, True),
         ({"lpips": "/weights"}, {"lpips_net": None}, False),
         ({"lpips": "/weights"}, {"lpips_net": "vgg"}, True),
         ({"lpips": "/weights", "lpips_net": "alex"}, {"lpips_net": "vgg"}, False),
-        ({"as_taken": True}, {"frames": "undistorted"}, False),
-        ({"as_taken": True}, {}, False),
-        ({"as_taken": True}, {"frames": "as taken"}, True),
     ],
 )
 def test_a_cell_is_evaluated_again_if_its_metrics_are_not_what_is_asked_for(tmp_path, options, metrics, expected):

@@ -102,7 +102,6 @@ def test_all_cells_are_trained_and_all_files_written(sweep, tmp_path, capsys):
     assert sweep() == (0, ["as-full-seed0", "as-plain-seed0", "as-full-seed1", "as-plain-seed1"])
     printed = capsys.readouterr().out
     assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 |" in printed
-    assert "undistorted" not in printed  # frames compared as they were taken need no note
     text = (tmp_path / "out/table.md").read_text()
     assert f"warpgs train --preset quick --data {tmp_path}/as --out {tmp_path}/out/as-full-seed0" in text
     assert r"20.50 $\pm$ 0.71" in (tmp_path / "out/table.tex").read_text()
@@ -237,23 +236,22 @@ def test_finished_cells_that_lack_what_is_asked_for_are_evaluated_again(sweep, t
         assert job.is_trained
         path = tmp_path / "out" / job.name / "metrics.json"
         lpips = {"lpips": 0.25, "lpips_net": "vgg"} if "--lpips" in job.evaluation else {}
-        frames = {"frames": "as taken" if "--as-taken" in job.evaluation else "undistorted"}
         kept = {name: json.loads(path.read_text())[name] for name in ("psnr", "iterations", "train_seconds")}
-        path.write_text(json.dumps({**kept, **lpips, **frames}))
+        path.write_text(json.dumps({**kept, **lpips}))
 
     weights = tmp_path / "weights"
     weights.mkdir()
     for name in ("vgg16.pth", "lpips_v0.1_vgg_lin.pth"):
         (weights / name).touch()
     sweep()
-    for options in (["--lpips", str(weights)], ["--as-taken"]):  # the second one keeps LPIPS
-        capsys.readouterr()
-        code, evaluated = sweep(*options, by=evaluate)
-        assert (code, len(evaluated)) == (0, 4)
-        assert "| full | 20.50 ± 0.71 | 0.2500 ± 0.0000 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
-        assert sweep(*options) == sweep() == (0, [])
+    options = ["--lpips", str(weights)]
+    capsys.readouterr()
+    code, evaluated = sweep(*options, by=evaluate)
+    assert (code, len(evaluated)) == (0, 4)
+    assert "| full | 20.50 ± 0.71 | 0.2500 ± 0.0000 | 1.0 ± 0.0 | 2 |" in capsys.readouterr().out
+    assert sweep(*options) == sweep() == (0, [])
     for text in ((tmp_path / "out/sweep.json").read_text(), (tmp_path / "out/table.md").read_text()):
-        assert text.count(f"--lpips {weights}") == text.count("--as-taken") == 4
+        assert text.count(f"--lpips {weights}") == 4
 
 
 def test_networks_of_lpips_are_not_mixed_without_a_note(sweep, tmp_path, capsys):
@@ -265,7 +263,7 @@ def test_networks_of_lpips_are_not_mixed_without_a_note(sweep, tmp_path, capsys)
     assert "LPIPS is of different networks (alex in 1, vgg in 1 trainings)" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("options", [["--lpips", "weights"], ["--lpips-net", "alex"], ["--as-taken"]])
+@pytest.mark.parametrize("options", [["--lpips", "weights"], ["--lpips-net", "alex"]])
 def test_tables_alone_evaluate_nothing(sweep, capsys, options):
     sweep()
     assert sweep("--tables-only", *options) == (2, [])
@@ -397,7 +395,7 @@ def test_cells_whose_capture_was_deleted_fail_and_keep_what_was_measured(sweep, 
     sweep()
     shutil.rmtree(tmp_path / "as")
     capsys.readouterr()
-    assert sweep("--seeds", "3", "--as-taken") == (1, [])
+    assert sweep("--seeds", "3") == (1, [])
     printed = capsys.readouterr().out
     assert "| full | 20.50 ± 0.71 | 1.0 ± 0.0 | 2 of 3 |" in printed
     assert f"as-plain-seed2: {tmp_path}/as does not exist\n" in printed
@@ -429,28 +427,6 @@ def test_tables_alone_of_a_folder_without_the_sweep_are_refused(sweep, tmp_path,
     assert sweep("--tables-only") == (2, [])
     assert f"{tmp_path}/out has no training of this sweep" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize(
-    ("undistorted", "note"),
-    [
-        ("0123", "Frames of as were undistorted, and so resampled, before they were compared."),
-        ("02", "Frames of as (2 of 4 trainings) were undistorted"),
-    ],
-)
-def test_a_note_says_which_frames_were_resampled(sweep, tmp_path, capsys, undistorted, note):
-    def finish(job):
-        sweep.finish(job)
-        index = ["as-full-seed0", "as-plain-seed0", "as-full-seed1", "as-plain-seed1"].index(job.name)
-        frames = "undistorted" if str(index) in undistorted else "as taken"
-        edit_json(tmp_path / "out" / job.name / "metrics.json", frames=frames)
-
-    assert sweep(by=finish)[0] == 0
-    printed = capsys.readouterr().out
-    assert note in printed
-    assert "The same sweep with --as-taken compares them as they were taken" in printed
-    for name in ("table.md", "table.tex", "report.html"):
-        assert note in (tmp_path / "out" / name).read_text()
 
 
 def test_numbers_of_others_stand_beside(sweep, tmp_path, capsys):

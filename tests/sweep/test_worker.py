@@ -65,18 +65,18 @@ def test_a_new_cell_gets_its_arguments_and_one_that_has_begun_is_resumed(tmp_pat
     assert run_job(job(tmp_path, "--seed", "3")) is None
     (tmp_path / "cell").mkdir()
     (tmp_path / "cell/config.json").write_text("{}")
-    assert run_job(job(tmp_path, "--seed", "3")._replace(evaluation=("--as-taken",))) is None
+    assert run_job(job(tmp_path, "--seed", "3")._replace(evaluation=("--lpips", "w"))) is None
     lines = (tmp_path / "logs/cell.log").read_text().splitlines()
     assert lines[1] == "['train', '--seed', '3', '--device', 'cpu']"
-    assert lines[3] == f"['train', '--resume', '{tmp_path}/cell', '--as-taken', '--device', 'cpu']"
+    assert lines[3] == f"['train', '--resume', '{tmp_path}/cell', '--lpips', 'w', '--device', 'cpu']"
 
 
 def test_a_cell_that_is_trained_is_evaluated(tmp_path, finished_run):
     cell = shutil.copytree(finished_run, tmp_path / "cell")
-    assert run_job(job(tmp_path)._replace(evaluation=("--as-taken",), is_trained=True)) is None
+    assert run_job(job(tmp_path)._replace(evaluation=("--quiet",), is_trained=True)) is None
     assert json.loads((cell / "metrics.json").read_text())["psnr"] > 0
     log = (tmp_path / "logs/cell.log").read_text()
-    assert log.startswith(f"{HOST}: warpgs eval {cell} --as-taken --device cpu\n")
+    assert log.startswith(f"{HOST}: warpgs eval {cell} --quiet --device cpu\n")
 
 
 def test_a_cell_that_is_killed_says_by_what(tmp_path, monkeypatch):

@@ -360,8 +360,8 @@ def test_a_run_that_is_resumed_is_evaluated_as_it_is_told_now(config, tmp_path, 
     monkeypatch.setattr(script, "evaluate_run", lambda *arguments: given.append(arguments[2:]) or "")
     for name in ("alexnet.pth", "lpips_v0.1_alex_lin.pth"):
         (tmp_path / name).touch()
-    warpgs.train(TrainConfig(resume=config.out, lpips=tmp_path, lpips_net="alex", as_taken=True))
-    assert given == [((tmp_path, "alex"), "cpu", True, True)]
+    warpgs.train(TrainConfig(resume=config.out, lpips=tmp_path, lpips_net="alex"))
+    assert given == [((tmp_path, "alex"), "cpu", True)]
 
 
 def test_ctrl_c_in_the_evaluation_says_how_to_evaluate(config, monkeypatch):
@@ -373,8 +373,8 @@ def test_ctrl_c_in_the_evaluation_says_how_to_evaluate(config, monkeypatch):
         warpgs.train(config)
     (config.out / "alexnet.pth").touch()
     (config.out / "lpips_v0.1_alex_lin.pth").touch()
-    given = TrainConfig(resume=config.out, lpips=config.out, lpips_net="alex", as_taken=True)
-    with pytest.raises(KeyboardInterrupt, match=f"{config.out} --lpips {config.out} --lpips-net alex --as-taken$"):
+    given = TrainConfig(resume=config.out, lpips=config.out, lpips_net="alex")
+    with pytest.raises(KeyboardInterrupt, match=f"{config.out} --lpips {config.out} --lpips-net alex$"):
         warpgs.train(given)
 
 
@@ -412,7 +412,7 @@ def test_a_damaged_evaluation_frame_is_refused_before_training(held_out, kind, d
     assert is_resumed or not given.out.exists()
 
 
-def test_evaluation_frames_are_read_after_what_costs_no_time_and_as_they_were_taken_if_asked_for(held_out, monkeypatch):
+def test_evaluation_frames_are_read_after_what_costs_no_time(held_out, monkeypatch):
     given, _ = held_out
     read = Mock(side_effect=ValueError("read"))
     monkeypatch.setattr(script, "check_views", read)
@@ -422,11 +422,10 @@ def test_evaluation_frames_are_read_after_what_costs_no_time_and_as_they_were_ta
         script.make_trainer(given)
     read.assert_not_called()
     (given.out / "file").unlink()
-    for as_taken in (False, True):
-        for log in (None, Mock()):
-            with pytest.raises(ValueError, match=r"^read$"):
-                script.make_trainer(dataclasses.replace(given, as_taken=as_taken), log)
-            assert read.call_args.args[1:] == (as_taken, log is None)
+    for log in (None, Mock()):
+        with pytest.raises(ValueError, match=r"^read$"):
+            script.make_trainer(given, log)
+        assert read.call_args.args[1:] == (log is None,)
 
 
 def test_an_evaluation_frame_damaged_in_training_leaves_a_trained_run_and_says_how_to_evaluate_it(held_out):
@@ -465,31 +464,35 @@ def test_half_precision_on_part_of_the_multiprocessors_is_refused_before_trainin
     assert not Run.open(config.out).trained_scene().scene.appearance.trunk.uses_half
 
 
-def test_a_run_is_evaluated_again_as_its_config_says(config, monkeypatch):
-    warpgs.train(dataclasses.replace(config, as_taken=True))
-    taken, evaluate = [], evaluate_run.evaluate
-    monkeypatch.setattr(
-        evaluate_run, "evaluate", lambda *arguments: taken.append(arguments[-1]) or evaluate(*arguments)
-    )
-    evaluate_run.evaluate_run(config.out, quiet=True)
-    assert taken == [True]
-
-
-@pytest.mark.parametrize("undistort", [True, False])
-def test_a_run_without_undistortion_is_trained_and_evaluated_on_frames_as_they_were_taken(config, tmp_path, undistort):
+@pytest.mark.parametrize("distortion", [True, False])
+def test_a_run_is_trained_and_evaluated_on_recorded_frames_with_the_lens_or_a_centred_pinhole(
+    config, tmp_path, distortion
+):
     data = shutil.copytree(config.data, tmp_path / "bent")
     for path in (data / "camera").iterdir():
         edit_json(path, radial_distortion=[0.5, 0.0, 0.0], principal_point=[14.0, 13.0])
-    config, shown = dataclasses.replace(config, data=data, undistort=undistort), []
+    config, shown = dataclasses.replace(config, data=data, distortion=distortion), []
     run = warpgs.train(config, callbacks=[lambda progress: shown.append(progress.capture)])
-    metrics = json.loads((run.folder / "metrics.json").read_text())
-    assert metrics["frames"] == ("undistorted" if undistort else "as taken")
     name = shown[0].val[0]
-    taken = read_image(data / f"rgb/1x/{name}.png", (32, 24))
+    recorded = read_image(data / f"rgb/1x/{name}.png", (32, 24))
     for capture in (shown[0], warpgs.open_run(run.folder, "cpu").open_capture(quiet=True)):
-        is_centred = capture.cameras[name].K[:2, 2].tolist() == [16.0, 12.0]
-        is_taken = np.array_equal(capture.frame(name).image.numpy(), taken)
-        assert is_centred == is_taken == (not undistort)
+        camera = capture.cameras[name]
+        assert camera.K[:2, 2].tolist() == ([14.0, 13.0] if distortion else [16.0, 12.0])
+        assert (camera.distortion is not None) == distortion
+        assert np.array_equal(capture.frame(name).image.numpy(), recorded)
+
+
+def test_a_run_on_undistorted_frames_is_evaluated_but_not_resumed(config, tmp_path):
+    data = shutil.copytree(config.data, tmp_path / "bent")
+    run = warpgs.train(dataclasses.replace(config, data=data))
+    edit_json(run.folder / "config.json", distortion=None, undistort=True)
+    assert warpgs.train(TrainConfig(resume=run.folder)).config.distortion
+    for path in (data / "camera").iterdir():
+        edit_json(path, radial_distortion=[0.1, 0.0, 0.0])
+    edit_json(run.folder / "config.json", distortion=None, undistort=True)
+    with pytest.raises(ValueError, match=r"cannot be resumed: its frames were undistorted"):
+        warpgs.train(TrainConfig(resume=run.folder))
+    assert "PSNR" in evaluate_run.evaluate_run(run.folder, quiet=True)
 
 
 def test_train_raises_on_an_unknown_dataset_or_model(config):

@@ -141,7 +141,7 @@ def bench_fps(folder: Path, device: str) -> dict[str, Any]:
     """Frames per second of a run's newest checkpoint through its evaluation cameras; prints and returns the results."""
     run = Run.open(folder, "cuda" if device == "cuda" else "cpu")
     capture, scene = run.open_capture(), run.trained_scene()
-    cameras = [capture.cameras[name].to(scene.device) for name in capture.val or capture.train]
+    cameras = [capture.cameras[name].pinhole.to(scene.device) for name in capture.val or capture.train]
     result = {
         "run": str(folder),
         "width": cameras[0].width,

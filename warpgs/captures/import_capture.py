@@ -1,4 +1,4 @@
-"""Copies a capture of any layout into the layout of warpgs, undistorted and in scene units."""
+"""Copies a capture of any layout into the layout of warpgs, in scene units."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -100,7 +100,8 @@ def _write_frames(folder: Path, capture: Capture, names: Sequence[str], quiet: b
             writer.write_mask(folder, name, frame.static_mask.numpy(), FACTORS)
             num_masks += 1
         if frame.inverse_depth is not None:
-            writer.write_depth(folder, name, np.minimum(frame.inverse_depth.numpy(), MAX_HALF).astype(np.float16))
+            inverse = frame.inverse_depth.numpy() / Lens.of(frame.camera).axial_depths()
+            writer.write_depth(folder, name, np.minimum(inverse, MAX_HALF).astype(np.float16))
             num_depths += 1
         if frame.covisible is not None:
             writer.write_covisible(folder, name, frame.covisible.numpy(), FACTORS)
@@ -109,7 +110,7 @@ def _write_frames(folder: Path, capture: Capture, names: Sequence[str], quiet: b
 
 
 def _write_view(folder: Path, frame: Frame) -> None:
-    lens = Lens.pinhole(frame.camera.K, frame.camera.size)
+    lens = Lens.of(frame.camera)
     rotation, position = frame.camera.viewmat[:3, :3].double(), frame.camera.position.double()
     writer.write_image(folder, frame.name, frame.image.numpy(), FACTORS)
     writer.write_camera(folder, frame.name, lens, rotation.numpy(), position.numpy())

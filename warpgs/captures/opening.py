@@ -26,7 +26,7 @@ def load_capture(
     factor: int | None = None,
     perturbation: MaskPerturbation | None = None,
     cache_frames: int = LoadOptions.cache_frames,
-    undistort: bool = LoadOptions.undistort,
+    distortion: bool = LoadOptions.distortion,
 ) -> Capture:
     """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
 
@@ -36,16 +36,16 @@ def load_capture(
         factor: Downscaling factor of the images; the dataset's default if None.
         perturbation: Perturbation of the training masks; evaluation frames keep the true ones.
         cache_frames: Number of frames to keep in memory.
-        undistort: Whether to undistort frames, masks and depth; if not, they are those of the files, and cameras are
-            pinholes of the lens's focal length with the principal point at the centre of the image. HyperNeRF's
-            captures of two cameras (vrig) have a default factor of 4 then, as in Deformable-3DGS.
+        distortion: Whether cameras have the distortion and the principal point of their lens; if not, they are pinholes
+            with the principal point at the centre of the image. HyperNeRF's captures of two cameras (vrig) have a
+            default factor of 4 then, as in Deformable-3DGS.
 
     Raises:
         ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
     """
     if not isinstance(root, str | os.PathLike):
         raise ValueError(f"a capture is opened by the path of its folder, got {reprlib.repr(root)}")
-    options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, undistort)
+    options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, distortion)
     capture = load_with(capture_folder(root, factor=factor), dataset, options)
     capture.is_builtin = is_builtin(root)
     return capture
@@ -64,7 +64,7 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         require_factor("builtin:room", config.factor)
         root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     damage = MaskPerturbation.parse(config.damage_masks)
-    options = LoadOptions(config.factor, damage, undistort=config.undistort, depth=config.depth)
+    options = LoadOptions(config.factor, damage, distortion=config.distortion, depth=config.depth)
     capture = load_with(root, config.dataset, options)
     capture.is_builtin = config.data is None or is_builtin(config.data)
     if config.background == "capture" or config.background == "mean":

@@ -26,7 +26,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Import:
-    """Copies a capture of any layout into that of warpgs (docs/capture-format.md), undistorted and in scene units."""
+    """Copies a capture of any layout into that of warpgs (docs/capture-format.md), in scene units."""
 
     source: Annotated[Path, tyro.conf.arg(metavar="SOURCE"), tyro.conf.Positional]
     """Folder of a capture: COLMAP, nerfstudio, D-NeRF, LLFF, NVIDIA, ViPE, MegaSaM, NeRF-DS, HyperNeRF or iPhone."""

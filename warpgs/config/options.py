@@ -35,10 +35,10 @@ class TrainConfig:
     megasam; recognized from its files if omitted."""
     factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
     """Downscaling factor of the images (folder rgb/<factor>x); the dataset's default if omitted."""
-    undistort: bool = True
-    """Undistort frames, masks and depth, and keep each camera's principal point. Without it the run is trained and
-    evaluated on frames as Deformable-3DGS reads them (paper): as they are, with pinhole cameras whose principal point
-    is the centre, and those of HyperNeRF's captures of two cameras (vrig) at a factor of 4."""
+    distortion: bool = True
+    """Project by the principal point and the distortion of each camera's lens. Without it cameras are as in
+    Deformable-3DGS (paper): pinholes whose principal point is the centre, and HyperNeRF's captures of two cameras
+    (vrig) have a factor of 4."""
     out: Path | None = None
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None
@@ -95,8 +95,6 @@ class TrainConfig:
     """Folder with the weights of LPIPS, for the evaluation at the end."""
     lpips_net: NetName = "vgg"
     """Network of LPIPS: vgg (3DGS), alex (DyCheck's mLPIPS) or squeeze."""
-    as_taken: bool = False
-    """Whether the evaluation at the end compares frames as they were taken, with the distortion of their lens."""
 
     @property
     def render_settings(self) -> RenderSettings:

@@ -11,7 +11,7 @@ BEST = TrainConfig()
 PAPER = replace(
     BEST,
     preset="paper",
-    undistort=False,
+    distortion=False,
     assume="masks",
     background="capture",
     frozen="all",

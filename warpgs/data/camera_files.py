@@ -1,7 +1,6 @@
 """Camera files of the layout of Nerfies: camera/<id>.json."""
 
 import reprlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from jaxtyping import Float
 from warpgs.cameras import Camera
 from warpgs.files import read_json, read_numbers
 
-from .lens import Lens, pinhole_matrix
+from .lens import Lens
 from .units import SceneUnits
 
 MAX_ROTATION_ERROR = 1e-3
@@ -24,9 +23,9 @@ def is_rotation(matrix: Float[np.ndarray, "3 3"]) -> bool:
 
 
 def read_camera(
-    path: Path, units: SceneUnits, factor: int, time: float, used: Callable[[Lens], Lens] = lambda lens: lens
+    path: Path, units: SceneUnits, factor: int, time: float, distortion: bool = True
 ) -> tuple[Camera, Lens]:
-    """The pinhole camera of a frame, and the lens that its image is undistorted for.
+    """The camera of a frame, and its lens.
 
     In the file, ``orientation`` is the world-to-camera rotation (OpenCV axes) and ``position`` the camera centre in the
     world. Focal length and principal point are in pixels of the full size.
@@ -36,21 +35,21 @@ def read_camera(
         units: Scene units of the capture.
         factor: Downscaling factor of the image.
         time: Time of the frame in [0, 1].
-        used: The lens that an image is undistorted for, from that of the file.
+        distortion: Whether with its distortion and principal point; see ``load_capture``.
 
     Raises:
         ValueError: If the file is missing or damaged, or a field is missing or invalid.
     """
     fields = read_json(path, "every frame needs its camera")
-    lens = used(_lens(path, fields, factor))
+    lens = _lens(path, fields, factor)
+    lens = lens if distortion else lens.centered_pinhole
     rotation, position = read_numbers(path, fields, "orientation", (3, 3)), read_numbers(path, fields, "position", (3,))
     if not is_rotation(rotation):
         raise ValueError(f"{path}: orientation is not a rotation")
     try:
-        K, center = pinhole_matrix(lens.checked()), units.from_world(position)
+        return lens.checked().camera(rotation, units.from_world(position), time), lens
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return Camera.posed(rotation, center, K, (lens.width, lens.height), time), lens
 
 
 def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
@@ -62,6 +61,11 @@ def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
     tangential = "tangential_distortion" if "tangential_distortion" in fields else "tangential"
     k1, k2, k3 = _coefficients(path, fields, "radial_distortion", 3)
     p1, p2 = _coefficients(path, fields, tangential, 2)
+    rational = _coefficients(path, fields, "rational_distortion", 3)
+    radial = (k1, k2, p1, p2, k3, *rational, *_coefficients(path, fields, "prism_distortion", 4))
+    fisheye = _coefficients(path, fields, "fisheye_distortion", 4) if "fisheye_distortion" in fields else None
+    if fisheye is not None and any(radial):
+        raise ValueError(f"{path}: a fisheye_distortion cannot have others beside it")
     full = read_numbers(path, fields, "image_size", (2,))
     # Rounded as in Nerfies, whose code created the images.
     width, height = (round(float(side) / factor) for side in full)
@@ -70,8 +74,8 @@ def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
         height=height,
         focal=(focal / factor, focal * aspect / factor),
         center=(float(x), float(y)),
-        radial=(k1, k2, k3),
-        tangential=(p1, p2),
+        coefficients=radial if fisheye is None else tuple(fisheye),
+        model="radial" if fisheye is None else "fisheye",
     )
 
 

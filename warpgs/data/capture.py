@@ -109,21 +109,6 @@ class Conventions:
     depth_unit: str | None = None
 
 
-@dataclass(frozen=True)
-class TakenFrame:
-    """A frame as it was taken, with the distortion of its lens.
-
-    Attributes:
-        frame: With [H, W] image and masks as they are in the files. Its camera is a pinhole that sees at least as much,
-            with the same focal length, so that its image is usually larger.
-        positions: [H, W, 2] column and row in the camera's image of what each pixel of the frame shows; centres of
-            pixels are at +0.5.
-    """
-
-    frame: Frame
-    positions: Float[Tensor, "H W 2"]
-
-
 @dataclass(eq=False, repr=False)
 class Capture:
     """A capture in scene units: a position p of the files is (p − center) · scale.
@@ -140,7 +125,6 @@ class Capture:
         read: Reads a frame; called for frames that are not among the last ``cache_frames`` read.
         cache_frames: Maximum number of frames to keep in memory, of which large ones are fewer: ``MAX_CACHE_BYTES``.
         metric_depth: Whether inverse depth has scene units and no offset, so that it is not aligned.
-        read_taken: Reads a frame with the distortion of its lens; None if ``read`` undistorts no frame.
         estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
         background: Colour behind everything; black is also that of captures whose images show no background.
         time_source: Where the times of the cameras come from.
@@ -167,7 +151,6 @@ class Capture:
     unmasked: Assumption = "masks"
     metric_depth: bool = False
     estimated_masks: bool = False
-    read_taken: Callable[[str], TakenFrame] | None = None
     background: Background = "black"
     is_builtin: bool = False
     notes: Sequence[str] = ()

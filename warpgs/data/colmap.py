@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from .colmap_files import read_model
-from .lens import Lens, unsupported_model
+from .lens import Lens, LensModel, unsupported_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -26,7 +26,7 @@ NUM_PARAMETERS = {
     "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "OPENCV_FISHEYE": 8,
 }  # fmt: skip
 """Camera models that can be represented, and the number of their parameters: focal lengths, principal point, and
-k1, k2, p1, p2, k3 as far as the model has them, or k1 to k4 of a fisheye lens."""
+OpenCV's coefficients as far as the model has them."""
 
 
 class ModelImage(NamedTuple):
@@ -46,12 +46,8 @@ class Model(NamedTuple):
     notes: list[str]
 
 
-def load_model(folder: Path, undistort: bool = True) -> Model:
+def load_model(folder: Path) -> Model:
     """The model of a folder.
-
-    Args:
-        folder: Folder of the model.
-        undistort: Whether its images are to be undistorted; if not, lenses may distort too strongly for that.
 
     Raises:
         ValueError: If a file is missing or damaged, or a camera model cannot be represented.
@@ -63,7 +59,7 @@ def load_model(folder: Path, undistort: bool = True) -> Model:
         if image.has_pose:
             camera = model.cameras[image.camera_id]
             try:
-                lens = lens_of(camera, undistort)
+                lens = lens_of(camera)
             except ValueError as error:
                 raise ValueError(f"{folder}: camera {image.camera_id}: {error}") from error
             images.append(ModelImage(image.name, lens, image.cam_from_world().matrix()))
@@ -73,41 +69,33 @@ def load_model(folder: Path, undistort: bool = True) -> Model:
     return Model(images, points, colors, notes)
 
 
-def lens_of(camera: pycolmap.Camera, undistort: bool = True) -> Lens:
+def lens_of(camera: pycolmap.Camera) -> Lens:
     """The lens of a camera of a model; as ``lens_of_parameters``."""
-    return lens_of_parameters(camera.model.name, (camera.width, camera.height), camera.params.tolist(), undistort)
+    return lens_of_parameters(camera.model.name, (camera.width, camera.height), camera.params.tolist())
 
 
-def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float], undistort: bool = True) -> Lens:
+def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float]) -> Lens:
     """The lens of a camera model, the (width, height) of its images, and its parameters.
 
     Args:
         model: Name of the camera model.
         size: Width and height of the images [px].
         params: Parameters of the camera model.
-        undistort: Whether the images are to be undistorted; if not, the lens may distort too strongly for that.
 
     Raises:
         ValueError: If the camera model cannot be represented, or a number is missing or out of range.
     """
-    if model not in NUM_PARAMETERS or any(params[9:]):
+    if model not in NUM_PARAMETERS:
         raise ValueError(unsupported_model(model, "first run colmap image_undistorter, whose output is read"))
     if len(params) != NUM_PARAMETERS[model]:
         raise ValueError(f"{model} has {NUM_PARAMETERS[model]} parameters, got {len(params)}")
-    fx, fy, cx, cy, *distortion = (params[0], *params) if model in SIMPLE else params
-    distortion = [*distortion, *[0.0] * 5]
-    if model.endswith("FISHEYE"):
-        k1, k2, k3, k4 = distortion[:4]
-        return Lens(*size, (fx, fy), (cx, cy), fisheye=(k1, k2, k3, k4)).checked(undistort)
-    k1, k2, p1, p2, k3 = distortion[:5]
-    return Lens(*size, (fx, fy), (cx, cy), (k1, k2, k3), (p1, p2)).checked(undistort)
+    fx, fy, cx, cy, *coefficients = (params[0], *params) if model in SIMPLE else params
+    kind: LensModel = "fisheye" if model.endswith("FISHEYE") else "radial"
+    return Lens(*size, (fx, fy), (cx, cy), tuple(coefficients), kind).checked()
 
 
 def parameters_of_lens(lens: Lens) -> tuple[str, list[float]]:
     """The camera model that represents a lens, and its parameters."""
-    k1, k2, k3 = lens.radial
-    own = [*lens.focal, *lens.center]
-    if lens.fisheye is not None:
-        return "OPENCV_FISHEYE", [*own, *lens.fisheye]
-    perspective = [*own, k1, k2, *lens.tangential]
-    return ("FULL_OPENCV", [*perspective, k3, 0.0, 0.0, 0.0]) if k3 else ("OPENCV", perspective)
+    name = "OPENCV_FISHEYE" if lens.model == "fisheye" else "OPENCV" if len(lens.coefficients) <= 4 else "FULL_OPENCV"
+    parameters = [*lens.focal, *lens.center, *lens.coefficients, *[0.0] * 8]
+    return name, parameters[: NUM_PARAMETERS[name]]

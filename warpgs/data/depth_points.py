@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from .lens import Lens
+
 MAX_POINTS = 40_000
 """Maximum number of points."""
 
@@ -18,16 +20,16 @@ class DepthView(NamedTuple):
 
     Attributes:
         image: [H, W, 3] RGB.
-        inverse_depth: [H, W] in the units of the pose, NaN where unknown.
+        inverse_depth: [H, W] along the optical axis, in the units of the pose, NaN where unknown.
         static: [H, W] true where static.
-        K: [3, 3] intrinsics, pixel centres at +0.5.
+        lens: The lens, of images of this size.
         pose: [3, 4] world to camera, OpenCV axes.
     """
 
     image: UInt8[np.ndarray, "H W 3"]
     inverse_depth: Float[np.ndarray, "H W"]
     static: Bool[np.ndarray, "H W"]
-    K: Float[np.ndarray, "3 3"]
+    lens: Lens
     pose: Float[np.ndarray, "3 4"]
 
 
@@ -58,8 +60,8 @@ def points_of_views(views: Sequence[DepthView]) -> tuple[Float[np.ndarray, "P 3"
 
 
 def _unproject(view: DepthView, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], 1)
-    in_camera = (pixels @ np.linalg.inv(view.K).T) / view.inverse_depth[row, column][:, None]
+    x, y = view.lens.unproject(column + 0.5, row + 0.5)
+    in_camera = np.stack([x, y, np.ones(len(row))], 1) / view.inverse_depth[row, column][:, None]
     return (in_camera - view.pose[:, 3]) @ view.pose[:, :3]
 
 
@@ -68,7 +70,8 @@ def _agrees(view: DepthView, points: np.ndarray) -> np.ndarray:
     in_camera = points @ view.pose[:, :3].T + view.pose[:, 3]
     depth = in_camera[:, 2]
     front = depth > 1e-9
-    pixels = (in_camera @ view.K.T)[:, :2] / np.where(front, depth, 1.0)[:, None]
+    x, y = in_camera[:, :2].T / np.where(front, depth, 1.0)
+    pixels = view.lens.image(x, y).T
     height, width = view.inverse_depth.shape
     inside = front & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
     column, row = np.where(inside[:, None], pixels, 0.0).astype(int).T

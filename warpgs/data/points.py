@@ -31,7 +31,7 @@ def read_points(root: Path, units: SceneUnits) -> tuple[Float[Tensor, "P 3"], UI
         colors = _read_colors(root / "point_colors.npy", points.shape)
     elif model.is_dir():
         path = model
-        _, points, stored, _ = load_model(model, undistort=False)
+        _, points, stored, _ = load_model(model)
         colors = torch.from_numpy(stored)
     else:
         return torch.zeros(0, 3, dtype=torch.float32), None

@@ -104,6 +104,13 @@ def write_camera(
         rotation: [3, 3] world-to-camera rotation, OpenCV axes.
         position: [3] camera centre in the world.
     """
+    k = [*lens.coefficients, *[0.0] * 12][:12]
+    radial = {
+        "radial_distortion": [k[0], k[1], k[4]],
+        "tangential_distortion": k[2:4],
+        **({"rational_distortion": k[5:8]} if any(k[5:8]) else {}),
+        **({"prism_distortion": k[8:]} if any(k[8:]) else {}),
+    }
     fields = {
         "orientation": rotation.tolist(),
         "position": position.tolist(),
@@ -111,8 +118,7 @@ def write_camera(
         "principal_point": lens.center,
         "skew": 0.0,
         "pixel_aspect_ratio": lens.focal[1] / lens.focal[0],
-        "radial_distortion": lens.radial,
-        "tangential_distortion": lens.tangential,
+        **(radial if lens.model == "radial" else {"fisheye_distortion": k[:4]}),
         "image_size": [lens.width, lens.height],
     }
     write_json(root / f"camera/{name}.json", fields)

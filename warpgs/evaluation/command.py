@@ -12,4 +12,4 @@ def run(options: Eval) -> None:
     weights, capture = (options.lpips, options.lpips_net), None
     if options.data is not None:
         capture = Run.open(options.run_folder, options.device, options.data).open_capture(options.quiet)
-    show(evaluate_run(options.run_folder, capture, weights, options.device, options.quiet, options.as_taken))
+    show(evaluate_run(options.run_folder, capture, weights, options.device, options.quiet))

@@ -40,7 +40,6 @@ def evaluate_run(
     lpips: tuple[Path | None, NetName | None] = (None, None),
     device: Device | None = None,
     quiet: bool = False,
-    as_taken: bool = False,
 ) -> str:
     """Evaluates the newest checkpoint of a run and writes the results into its folder.
 
@@ -50,7 +49,6 @@ def evaluate_run(
         lpips: Folder with the weights of LPIPS, and its network; those of the config where None.
         device: Device to render on; CUDA if None and there is a GPU.
         quiet: Whether to hide progress bars.
-        as_taken: Whether to compare frames with the distortion of their lens, also if the config does not say so.
 
     Returns:
         A summary to print.
@@ -67,8 +65,8 @@ def evaluate_run(
     scene = run.trained_scene()
     require_same_times(capture, scene.metadata)
     save_image, align = _image_writer(run, len(capture.val)), alignment(scene, capture.median_depth)
-    network, as_taken = network and network.to(scene.device), as_taken or run.config.as_taken
-    evaluation = evaluate(scene, capture, network, save_image, align, quiet, as_taken)
+    network = network and network.to(scene.device)
+    evaluation = evaluate(scene, capture, network, save_image, align, quiet)
     values = {**evaluation.summary(), "device": device_name(scene.device), **_of_run(scene, capture)}
     _write_metrics(run, {**known, **values, "commit": commit()}, evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg
@@ -133,8 +131,6 @@ def _summary(values: dict[str, Any]) -> str:
         lines.append(f"network of LPIPS: {values['lpips_net']}")
     if values["poses_aligned"]:
         lines.append("camera poses were corrected in training, so held-out cameras were aligned to the scene")
-    if values["frames"] == "undistorted":
-        lines.append("frames were undistorted, and so resampled; eval --as-taken compares them as they were taken")
     return "\n".join(lines)
 
 

@@ -21,8 +21,6 @@ class Eval:
     """Folder with the weights of LPIPS; else the one in WARPGS_LPIPS."""
     lpips_net: NetName | None = None
     """Network of LPIPS; by default that of the run's config, vgg unless it was changed."""
-    as_taken: bool = False
-    """Compare frames as they were taken, with the distortion of their lens; by default they are undistorted first."""
     data: Path | None = None
     """Current folder of the capture, if it was moved."""
     device: Literal["cuda", "cpu"] | None = None

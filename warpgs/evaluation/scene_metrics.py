@@ -46,8 +46,8 @@ def flicker(scene: Renderer, cameras: Sequence[Camera], quiet: bool) -> float | 
 
 
 def playback_rate(scene: Renderer, cameras: Sequence[Camera], quiet: bool) -> float:
-    """Joint images per second, including everything that depends on time."""
-    return frame_rate(scene.play, cameras)
+    """Joint images per second through pinholes, as viewers have, including everything that depends on time."""
+    return frame_rate(scene.play, [camera.pinhole for camera in cameras])
 
 
 def frame_rate(play: Callable[[Camera], object], cameras: Sequence[Camera]) -> float:

@@ -1,7 +1,7 @@
 """Adds what a capture lacks, with its own cameras: masks, depth, points.
 
-Frames of a capture may have lenses of their own. They are resampled to one pinhole camera, on which the methods of
-``MASKERS`` and ``DEPTHS`` work; results are resampled to each frame as its file has it, with its distortion.
+The methods of ``MASKERS`` and ``DEPTHS`` work on frames of one lens. If those of a capture have lenses of their own,
+they are resampled to one pinhole camera, and results to each frame as its file has it.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.images import decode, is_bright, read_mask
-from warpgs.data.lens import Lens, pinhole_matrix, undistort
+from warpgs.data.lens import Lens
 from warpgs.data.loaders import LOADERS, LoadOptions, missing_capture, recognize, require_finished
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.sampling import evenly_spaced_indices
@@ -233,9 +233,8 @@ class _Job:
             return
         names = self._names()
         frames, static, planes = self._depth(names, "flow")
-        K = pinhole_matrix(frames.lens)
         chosen = evenly_spaced_indices(len(names), MAX_POINT_FRAMES)
-        views = [DepthView(frames.images[k], planes[k], static[k], K, frames.poses[k]) for k in chosen]
+        views = [DepthView(frames.images[k], planes[k], static[k], frames.lens, frames.poses[k]) for k in chosen]
         points, colors = points_of_views(views)
         if len(points) == 0:
             raise ValueError(f"{self.root}: no points were found: the camera hardly moves, or its poses are wrong")
@@ -266,7 +265,7 @@ class _Job:
         return self.capture.in_time(names)
 
     def _posed(self, names: list[str], side: int, max_factor: float = np.inf) -> PosedFrames:
-        """The frames as one pinhole camera sees them, with the longer side resized to ``side``."""
+        """The frames as one lens sees them, with the longer side resized to ``side``."""
         sizes = {self.capture.cameras[name].size for name in names}
         if len(sizes) > 1:
             raise ValueError(f"{self.root} has images of several sizes, which cannot be compared")
@@ -276,14 +275,13 @@ class _Job:
         return self.posed[factor]
 
     def _resized(self, names: list[str], side: int, max_factor: float) -> PosedFrames:
-        K = np.median([self.capture.cameras[name].K.double().numpy() for name in names], axis=0)
-        common = Lens.pinhole(K, self.capture.cameras[names[0]].size)
+        common = _common([Lens.of(self.capture.cameras[name]) for name in names])
         images = []
         for name in progress(names, "reading images", self.log is None):
             frame = self.capture.frame(name)
             small = resize_to_side(frame.image.numpy(), side, max_factor)
             height, width = small.shape[:2]
-            own = Lens.pinhole(frame.camera.K, frame.camera.size).resized(width, height)
+            own = Lens.of(frame.camera).resized(width, height)
             images.append(_resampled(small, own, common.resized(width, height), cv2.INTER_LINEAR))
         poses = np.array([self.capture.cameras[name].viewmat[:3].double().numpy() for name in names])
         height, width = images[0].shape[:2]
@@ -300,7 +298,7 @@ class _Job:
         return np.array([center + distance * axis for center, axis in zip(centers, forward, strict=True)])
 
     def _static(self, names: list[str], lens: Lens) -> list[Bool[np.ndarray, "H W"]]:
-        """Static masks of the frames as the common camera sees them; all true where there is none."""
+        """Static masks of the frames as the common lens sees them; all true where there is none."""
         load_capture(self.root)  # refuses masks of some training frames only
         return [self._static_mask(name, lens) for name in names]
 
@@ -308,9 +306,8 @@ class _Job:
         path = find_mask(self._mask_folder(), self.factor, name)
         if path is None:
             return np.ones((lens.height, lens.width), bool)
-        camera, distorted = read_camera(self.root / f"camera/{name}.json", self.units, self.factor, 0.0)
-        dynamic = ~undistort(read_mask(path, camera.size), distorted)
-        own = Lens.pinhole(camera.K, camera.size)
+        camera, own = read_camera(self.root / f"camera/{name}.json", self.units, self.factor, 0.0)
+        dynamic = ~read_mask(path, camera.size)
         return _resampled(dynamic.astype(np.float32), own, lens, cv2.INTER_LINEAR) < 0.5
 
     def _lens(self, name: str) -> Lens:
@@ -322,14 +319,20 @@ class _Job:
             self.log(line)
 
 
+def _common(lenses: Sequence[Lens]) -> Lens:
+    """The lens of all frames, or a pinhole with the medians of their focal lengths and principal points."""
+    if len(set(lenses)) == 1:
+        return lenses[0]
+    fx, fy, cx, cy = np.median([(*lens.focal, *lens.center) for lens in lenses], axis=0).tolist()
+    return Lens(lenses[0].width, lenses[0].height, (fx, fy), (cx, cy))
+
+
 def _resampled(
     image: Float[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"], source: Lens, target: Lens, interpolation: int
 ) -> Float[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]:
-    """What a camera with the lens ``target`` sees of the image of a pinhole camera at the same place."""
+    """What a camera with the lens ``target`` sees of the image of another one at the same place."""
     if source == target:
         return image
     rays = pixel_rays(target)
-    x = source.focal[0] * rays[..., 0] + source.center[0] - 0.5
-    y = source.focal[1] * rays[..., 1] + source.center[1] - 0.5
-    maps = x.astype(np.float32), y.astype(np.float32)
-    return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    x, y = (source.image(rays[..., 0], rays[..., 1]) - 0.5).astype(np.float32)
+    return cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)

@@ -101,7 +101,7 @@ def doubts_of_lens(cameras: Cameras) -> list[str]:
             f"the focal length is a guess, {ratio:.1f} times the longer side of the frames: the one that was found is "
             "not plausible and explains less of them; give it (--focal PX)"
         ]
-    if lens.fisheye is not None or least <= ratio <= most:
+    if lens.model == "fisheye" or least <= ratio <= most:
         return []
     return [
         f"the focal length that was found is {ratio:.1f} times the longer side of the frames, which few lenses have: "

@@ -22,7 +22,7 @@ OUTPUTS = (
 FRAME = re.compile(r"frame_\d{6}\.(png|png\.png|npy|json)(\.partial)?")
 """Names of the files in these folders, also of those that were being written at an interruption."""
 
-VERSION = 5
+VERSION = 6
 """Version of the intermediate files; an unfinished preparation of another version starts afresh."""
 
 ADVICE = "free some disk space and run the same command again"

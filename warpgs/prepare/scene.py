@@ -10,7 +10,6 @@ from jaxtyping import Bool, UInt8
 from warpgs.captures.findings import few_of
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
-from warpgs.data.lens import undistort
 from warpgs.data.units import depth_range, scene_units
 
 from .cameras.recovered import Cameras
@@ -52,7 +51,7 @@ def write_capture(
         root: Folder of the capture.
         frames: All frames that were taken.
         cameras: Cameras of the registered frames.
-        dynamic: [H, W] dynamic mask of each undistorted frame of the cameras.
+        dynamic: [H, W] dynamic mask of each frame of the cameras.
         estimated: Whether the masks are estimates.
         holdout: Every N-th frame is for evaluation; 0 for none.
         quiet: Whether to show no progress.
@@ -83,9 +82,9 @@ def capture_files(root: Path, names: Sequence[str]) -> list[Path]:
 
 def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Cameras:
     if cameras.have_parallax:
-        points = cameras.points[static_points(cameras.undistorted(), dynamic)]
+        points = cameras.points[static_points(cameras, dynamic)]
     else:
-        points = points_around(cameras.undistorted(), dynamic)
+        points = points_around(cameras, dynamic)
     if len(points) < MIN_STATIC_POINTS:
         raise ValueError(
             f"only {len(points)} static points are left: nearly everything moves, or the masks are inverted "
@@ -98,7 +97,7 @@ def static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) 
     """[P] whether at least half of the frames that see a point see it in a static region.
 
     Args:
-        cameras: Cameras with a pinhole lens.
+        cameras: Cameras with points.
         dynamic: [H, W] dynamic mask of each camera, in the size of the lens.
     """
     lens, points = cameras.lens, cameras.points
@@ -123,31 +122,30 @@ def write_frames(
     shown: Collection[int] = (),
     quiet: bool = True,
 ) -> dict[int, UInt8[np.ndarray, "H W 3"]]:
-    """Writes undistorted images and masks in full and half size, and the camera of every frame.
+    """Writes images and masks in full and half size, and the camera of every frame.
 
     Args:
         root: Folder of the capture.
         folder: Folder of the frames as recorded.
         cameras: Cameras of the frames.
-        dynamic: [H, W] dynamic mask of each undistorted frame.
+        dynamic: [H, W] dynamic mask of each frame.
         shown: Indices of the images to return.
         quiet: Whether to show no progress.
 
     Returns:
-        [H, W, 3] undistorted images by index.
+        [H, W, 3] images by index.
 
     Raises:
         ValueError: If a frame was damaged since it was taken.
         OSError: If a file cannot be written; the message names it.
     """
-    lens, images = cameras.undistorted().lens, {}
+    images = {}
     originals = read_images(folder, cameras.names)
     for k, image in zip(progress(range(len(cameras.names)), "capture", quiet), originals, strict=True):
         name, pose = cameras.names[k], cameras.poses[k]
-        image = undistort(image, cameras.lens)
         writer.write_image(root, name, image, FACTORS)
         writer.write_mask(root, name, ~dynamic[k], FACTORS)
-        writer.write_camera(root, name, lens, pose[:, :3], -pose[:, :3].T @ pose[:, 3])
+        writer.write_camera(root, name, cameras.lens, pose[:, :3], -pose[:, :3].T @ pose[:, 3])
         if k in shown:
             images[k] = image
     return images

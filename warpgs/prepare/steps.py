@@ -198,10 +198,10 @@ class Steps:
         """The masks given by the user, in the size of the frames."""
 
         def make(path: Path) -> str:
-            files, undistorted = find_given_masks(Path(self.options.masks), self.frames.taken)
+            files = find_given_masks(Path(self.options.masks), self.frames.taken)
             dynamic = [read_dynamic(file, (self.frames.width, self.frames.height)) for file in files]
             self._require_space(MASK_BYTES)
-            return write_masks(path, self.frames.names, dynamic, undistorted)
+            return write_masks(path, self.frames.names, dynamic)
 
         return self.journal.result(name, Masks.load, make, self._mask_files(self.frames.names))
 

@@ -20,7 +20,7 @@ TITLES = {
 }
 """Headings of facts, and of metrics that reports show in another unit than sweeps."""
 
-UNRELATED = {"out", "resume", "preset", "lpips", "lpips_net", "as_taken"}
+UNRELATED = {"out", "resume", "preset", "lpips", "lpips_net"}
 """Settings that do not affect training."""
 
 Row = tuple[str, list[Any], list[str]]

@@ -102,6 +102,20 @@ def require_resumable(folder: Path) -> None:
         raise ValueError(f"{path} cannot be resumed: {reason}; the version that began the run can")
 
 
+def require_recorded(folder: Path, is_distorted: bool) -> None:
+    """Refuses to train a run of an earlier version on that was trained on undistorted frames of a distorted capture.
+
+    Raises:
+        ValueError: If it was. Such runs can be evaluated, viewed and exported.
+    """
+    path = folder / NAME
+    if is_distorted and read_json(path, max_bytes=MAX_BYTES).get("undistort"):
+        raise ValueError(
+            f"{path} cannot be resumed: its frames were undistorted, and this version trains on them as they were "
+            "recorded; the version that began the run can"
+        )
+
+
 def parse_config(values: dict[str, Any], source: Path | str) -> TrainConfig:
     """A training config from parsed JSON or TOML; newer fields that are not given are as in ``FORMER``.
 

@@ -8,7 +8,7 @@ from warpgs.runtime.devices import choose_device
 
 REMOVED_PRESETS = ("fast",)
 
-RENAMED = {"relight_from": "appearance_from"}
+RENAMED = {"relight_from": "appearance_from", "undistort": "distortion"}
 """Fields that earlier versions wrote under another name."""
 
 
@@ -45,6 +45,7 @@ DAMAGE = {"erode": "PIXELS", "dilate": "PIXELS", "holes": "FRACTION"}
 """Kinds of damage to masks, each of which had an option, and what it was measured in."""
 
 REMOVED: dict[str, Removed] = {
+    "as_taken": Removed("frames are always compared as they were recorded"),
     **{name: Removed(f"--omit {name} omits it") for name in COMPONENTS},
     "keep_checkpoints": Removed("the two newest are kept"),
     "masks": Removed("--damage-masks is for that"),
@@ -100,12 +101,12 @@ REMOVED: dict[str, Removed] = {
 
 FORMER: dict[str, dict[str, Any]] = {
     "": {
-        "as_taken": False,
         "background": "black",
         "data": None,
         "dataset": None,
         "depth": True,
         "device": None,
+        "distortion": True,
         "exposure": False,
         "factor": None,
         "iterations": None,
@@ -115,7 +116,6 @@ FORMER: dict[str, dict[str, Any]] = {
         "out": None,
         "preset": None,
         "resume": None,
-        "undistort": True,
     },
     "densify": {
         "max_elongation": 0.0,
@@ -152,9 +152,10 @@ been written by every version since 0.1.0: with a default in its place, a run wo
 def former_option(name: str) -> str:
     """The end of the message that there is no option ``name``: what became of it; empty if no version had it."""
     *section, field = name.lstrip("-").replace("-", "_").split(".")
+    field, no = field.removeprefix("no_"), "no-" if field.startswith("no_") else ""
     if field in RENAMED:
-        return f"; it is --{'.'.join([*section, RENAMED[field]]).replace('_', '-')} now"
-    removed = REMOVED.get(".".join([*section, field.removeprefix("no_")]))
+        return f"; it is --{'.'.join([*section, no + RENAMED[field]]).replace('_', '-')} now"
+    removed = REMOVED.get(".".join([*section, field]))
     return f" any more: {removed.advice}" if removed else ""
 
 
@@ -219,7 +220,7 @@ def _switches(values: dict[str, Any]) -> None:
 
 
 def _factor(values: dict[str, Any]) -> None:
-    """HyperNeRF's captures of two cameras had a factor of their own, whatever ``undistort`` is."""
+    """HyperNeRF's captures of two cameras had a factor of their own, whatever ``distortion`` is."""
     data, dataset = values.get("data"), values.get("dataset")
     if "vrig_factor" not in values or values.get("factor") is not None or not isinstance(data, str):
         return

@@ -21,7 +21,7 @@ from .spec import SweepSpec, Variant, check_name
 
 MAX_CELLS = 100_000
 
-EVALUATION = ("lpips", "lpips_net", "as_taken")
+EVALUATION = ("lpips", "lpips_net")
 """Options of ``warpgs train`` and ``warpgs eval`` that change how a run is evaluated, not how it is trained."""
 
 
@@ -216,7 +216,6 @@ def parse_evaluation(command: str) -> tuple[dict[str, Any], list[str]]:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
     parser.add_argument("--lpips", type=Path)
     parser.add_argument("--lpips-net")
-    parser.add_argument("--as-taken", action="store_true")
     found, words = parser.parse_known_args(shlex.split(command))
     return vars(found), words
 
@@ -230,7 +229,7 @@ def trained_captures(commands: Iterable[str]) -> list[str]:
 def as_evaluated_before(cell: Cell, command: str, given: Collection[str]) -> Cell:
     """The cell, evaluated as its command of before says, but for the options that were given or that its file has.
 
-    Another evaluation replaces the results: without this, one with ``--as-taken`` would drop LPIPS.
+    Another evaluation replaces the results: without this, it would drop LPIPS.
     """
     assert cell.config.preset is not None
     usual = PRESETS[cell.config.preset]
@@ -267,8 +266,7 @@ def finished_metrics(cell: Cell) -> dict[str, Any] | None:
 
 def is_evaluated(cell: Cell, metrics: Mapping[str, Any]) -> bool:
     """Whether the metrics of a finished cell have what its config asks for."""
-    has_lpips = cell.config.lpips is None or metrics.get("lpips_net") == cell.config.lpips_net
-    return has_lpips and (not cell.config.as_taken or metrics.get("frames") == "as taken")
+    return cell.config.lpips is None or metrics.get("lpips_net") == cell.config.lpips_net
 
 
 def is_started(cell: Cell) -> bool:

@@ -36,8 +36,6 @@ class Sweep:
     """Folder with the weights of LPIPS; finished trainings without LPIPS are evaluated again."""
     lpips_net: NetName | None = None
     """Network of LPIPS; vgg by default."""
-    as_taken: bool = False
-    """Compare frames as they were taken, with the distortion of their lens, also those of finished trainings."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to train on; CUDA by default if there is a GPU."""
     per_gpu: int = 1

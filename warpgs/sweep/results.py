@@ -25,15 +25,10 @@ def tables_of(board: Board, spec: SweepSpec, peers: Peers) -> list[Table]:
 
 
 def notes_of(board: Board) -> list[str]:
-    """Paragraphs below the tables: how much has finished, what was compared, and what failed and why."""
+    """Paragraphs below the tables: how much has finished, and what failed and why."""
     seconds = [metrics.get("train_seconds") for metrics in board.metrics.values()]
     total = _duration(float(sum(value for value in seconds if isinstance(value, int | float))))
     notes = [f"{len(board.metrics)} of {len(board.cells)} trainings finished, {total} of training in total."]
-    if resampled := _resampled(board):
-        notes.append(
-            f"Frames of {', '.join(resampled)} were undistorted, and so resampled, before they were compared. "
-            "The same sweep with --as-taken compares them as they were taken, without training again."
-        )
     networks = Counter(net for metrics in board.metrics.values() if (net := metrics.get("lpips_net")))
     if len(networks) > 1:
         numbers = ", ".join(f"{net} in {count}" for net, count in networks.items())
@@ -49,19 +44,6 @@ def _duration(seconds: float) -> str:
     if seconds < 60.0:
         return "1 second" if round(seconds) == 1 else f"{seconds:.0f} seconds"
     return f"{seconds / 60.0:.1f} minutes" if seconds < 3600.0 else f"{seconds / 3600.0:.2f} hours"
-
-
-def _resampled(board: Board) -> list[str]:
-    """The captures whose frames were compared undistorted; with the number of trainings if not in all of them."""
-    finished = [
-        (cell.scene, board.metrics[cell.name].get("frames")) for cell in board.cells if cell.name in board.metrics
-    ]
-    totals = Counter(scene for scene, _ in finished)
-    counts = Counter(scene for scene, frames in finished if frames == "undistorted")
-    return [
-        scene if count == totals[scene] else f"{scene} ({count} of {totals[scene]} trainings)"
-        for scene, count in counts.items()
-    ]
 
 
 def tables_text(spec: SweepSpec, board: Board, peers: Peers) -> str:

@@ -117,8 +117,8 @@ def _spec(options: Sweep) -> SweepSpec:
     spec = read_spec(options.sweep)
     if options.preset is not None and options.preset not in PRESETS:
         raise ValueError(not_one_of("--preset", options.preset, PRESETS))
-    if options.tables_only and (options.lpips or options.lpips_net or options.as_taken):
-        raise ValueError("--tables-only evaluates nothing: omit --lpips, --lpips-net and --as-taken")
+    if options.tables_only and (options.lpips or options.lpips_net):
+        raise ValueError("--tables-only evaluates nothing: omit --lpips and --lpips-net")
     for name in ("seeds", "per_gpu", "cpus"):
         value = getattr(options, name)
         if value is not None and not 1 <= value <= MAX_SEEDS:
@@ -138,7 +138,6 @@ def _overrides(options: Sweep) -> dict[str, Any]:
         "factor": options.factor,
         "lpips": str(Path(lpips).resolve()) if lpips and not options.tables_only else None,
         "lpips_net": options.lpips_net,
-        "as_taken": options.as_taken or None,
     }
     return {name: value for name, value in given.items() if value is not None}
 

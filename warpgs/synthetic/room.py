@@ -145,7 +145,7 @@ def write_builtin_capture(folder: Path, scene: BuiltinScene, device: torch.devic
         static = bodies < num_static
         writer.write_image(folder, name, to_bytes(image))
         writer.write_mask(folder, name, static.numpy())
-        lens = Lens.pinhole(camera.K, camera.size)
+        lens = Lens.of(camera)
         writer.write_camera(folder, name, lens, camera.viewmat[:3, :3].numpy(), camera.position.numpy())
         if not shift:
             writer.write_depth(folder, name, _monocular(depth, k / scene.num_frames))

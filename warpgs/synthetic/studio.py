@@ -27,7 +27,7 @@ from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.images import decode
-from warpgs.data.lens import Lens, pinhole_matrix
+from warpgs.data.lens import Lens
 from warpgs.data.units import SceneUnits
 from warpgs.visualize.images import to_bytes
 
@@ -116,7 +116,7 @@ def _pose(time: float, shift: float) -> tuple[Float[np.ndarray, "3 3"], Vector]:
 
 def _camera(time: float, shift: float, size: StudioSize) -> Camera:
     rotation, position = _pose(time, shift)
-    return Camera.posed(rotation, position, pinhole_matrix(_lens(size)), (size.width, size.height), time)
+    return _lens(size).camera(rotation, position, time)
 
 
 def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:

@@ -16,7 +16,7 @@ ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
 )
 
-RESUMING = {"--resume", "--data", "--device", "--iterations", "--lpips", "--lpips-net", "--as-taken", "--help"}
+RESUMING = {"--resume", "--data", "--device", "--iterations", "--lpips", "--lpips-net", "--help"}
 """Options that can be given with ``--resume``."""
 
 UNFIT = 1
@@ -34,7 +34,7 @@ def parse(arguments: Sequence[str], prog: str = "warpgs train") -> TrainConfig:
     options = {argument.split("=")[0].replace("_", "-") for argument in arguments if argument.startswith("--")}
     if "--resume" in options and (others := sorted(options - RESUMING)):
         raise ValueError(
-            "--resume takes all but --data, --device, --iterations, --lpips and --as-taken from the run's config.json: "
+            "--resume takes all but --data, --device, --iterations and --lpips from the run's config.json: "
             f"omit {others[0]}"
         )
     if {"--resume", "--lpips-net"} <= options and "--lpips" not in options:

@@ -21,7 +21,7 @@ from warpgs.initialization.prepare_start import prepare_again, prepare_start
 from warpgs.model.poses import PoseCorrections
 from warpgs.ops.mlp import check_half_precision
 from warpgs.runs import preview
-from warpgs.runs.config_file import read_config, require_resumable, write_config, write_start
+from warpgs.runs.config_file import read_config, require_recorded, require_resumable, write_config, write_start
 from warpgs.runs.logger import TrainingLogger, ignore
 from warpgs.runs.preview import Previewer
 from warpgs.runs.progress import Callback
@@ -106,10 +106,9 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
         # Without a terminal, there is no progress bar for minutes.
         log(f"evaluating {len(capture.val)} view{'s' * (len(capture.val) != 1)}")
     lpips = [] if config.lpips is None else ["--lpips", str(config.lpips), "--lpips-net", config.lpips_net]
-    as_taken = ["--as-taken"] if config.as_taken else []
-    later = f"run it with {command('eval', trainer.run, *lpips, *as_taken)}"
+    later = f"run it with {command('eval', trainer.run, *lpips)}"
     try:
-        log(evaluate_run(trainer.run, capture, weights, config.device, quiet, config.as_taken))
+        log(evaluate_run(trainer.run, capture, weights, config.device, quiet))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"training is done, evaluation stopped; {later}") from None
     except Exception:  # lack of memory, too, whose advice is about training
@@ -242,12 +241,13 @@ def _continued(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.Exi
     if ranks.is_first():
         locks.enter_context(found.lock())
     saved = extended(read_config(folder), config.iterations)
-    given = {name: getattr(config, name) for name in ("data", "lpips", "as_taken") if getattr(config, name)}
+    given = {name: getattr(config, name) for name in ("data", "lpips") if getattr(config, name)}
     if config.lpips is not None:
         given["lpips_net"] = config.lpips_net
     run = Run(folder, dataclasses.replace(saved, **given, device=_own_device(config.device or saved.device)))
     _require_usable(run.config)
     capture = _checked(run.open_capture(quiet), run.config, log)
+    require_recorded(folder, any(camera.distortion is not None for camera in capture.cameras.values()))
     _read_evaluation_frames(capture, run.config, quiet)
     trainer = Trainer(prepare_again(run.config, capture), run.folder)
     trainer.restore_newest(log)
@@ -281,5 +281,5 @@ def _checked(capture: Capture, config: TrainConfig, log: Log) -> Capture:
 def _read_evaluation_frames(capture: Capture, config: TrainConfig, quiet: bool) -> None:
     """Raises ValueError if the evaluation will fail to read a file: when training is done, it is too late."""
     if ranks.is_first():  # which evaluates
-        check_views(capture, config.as_taken, quiet)
+        check_views(capture, quiet)
     ranks.any_rank(False)  # a lost rank is found here: the others would prepare a start for nothing

@@ -1,7 +1,6 @@
 """Training views on the device."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
 from typing import NamedTuple
@@ -9,7 +8,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
 from warpgs.cache import cache_folder
 from warpgs.cameras import Camera
@@ -21,6 +19,7 @@ from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
 from .pixels import BYTES_PER_PIXEL, Pixels
+from .stacked_cameras import StackedCameras
 from .view_cache import ViewCache
 from .view_reader import Slot, ViewReader
 
@@ -92,26 +91,19 @@ class Views:
         self.device, self.poses = device, poses
         self._capture, self.background = capture, capture.background
         cameras = [capture.cameras[name] for name in capture.train]
-        self._viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device)
-        self._Ks = torch.stack([camera.K for camera in cameras]).to(device)
-        self._lenses = [camera.distortion for camera in cameras]
-        coefficients = [torch.zeros(0) if lens is None else lens.coefficients.float() for lens in self._lenses]
-        self._coefficients = pad_sequence(coefficients, batch_first=True).to(device)
-        motions = [torch.zeros(2, 3, dtype=torch.float32) if c.motion is None else c.motion for c in cameras]
-        self._motions = None if all(c.motion is None for c in cameras) else torch.stack(motions).to(device)
+        self._cameras = StackedCameras(cameras, device)
         self._times = torch.tensor([[camera.time] for camera in cameras], dtype=torch.float32, device=device)
         self._gains: Float[Tensor, "T 3"] | None = None
         self._reader = ViewReader(capture, mask_margin, pinned=device.type == "cuda")
         # New threads would use the first GPU, whatever the rank.
         setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
         self._read_ahead, self._slot = ReadAhead(self._reader.read, setup), Slot(device)
-        self.index = torch.zeros(1, dtype=torch.int64, device=device)
+        self.index, self._lens = torch.zeros(1, dtype=torch.int64, device=device), self._cameras.lenses[0]
         self.mask_trust = torch.ones(len(capture.train), dtype=torch.float32, device=device)
         sizes = [camera.size for camera in cameras]
         self.num_pixels = sum(width * height for width, height in sizes)
         have_one_size = len(set(sizes)) == 1
-        have_one_lens = len({None if lens is None else (lens.lens, lens.limit) for lens in self._lenses}) == 1
-        self.uses_graphs = graph and have_one_size and have_one_lens and device.type == "cuda"
+        self.uses_graphs = graph and have_one_size and self._cameras.have_one_lens and device.type == "cuda"
         bytes_per_pixel = BYTES_PER_PIXEL + (mask_margin > 0.0)
         self.resident = have_one_size and self.num_pixels * bytes_per_pixel <= resident_bytes
         self._reader.cache = self.cache = None if self.resident else ViewCache(cache_folder("decoded views"), sizes)
@@ -126,7 +118,7 @@ class Views:
 
     def __getitem__(self, index: int) -> View:
         on_device = self._pixels(index).map(lambda tensor: tensor.to(self.device))
-        return self._view(on_device, torch.full((1,), index, device=self.device), self._lenses[index])
+        return self._view(on_device, torch.full((1,), index, device=self.device), self._cameras.lenses[index])
 
     def _pixels(self, index: int) -> Pixels:
         """The pixels of a view, on the device if they are resident, else in host memory."""
@@ -186,7 +178,7 @@ class Views:
     def select(self, index: int) -> None:
         """Selects the view of an index, in the order of the current stream."""
         self.index.fill_(index)
-        self._lens = self._lenses[index]
+        self._lens = self._cameras.lenses[index]
         if not self.resident:
             self._slot.fill(self._read_ahead.take(index))
 
@@ -249,15 +241,12 @@ class Views:
         return camera if self.poses is None else self.poses.moved(camera, index)
 
     def _view(self, pixels: Pixels, index: Int64[Tensor, "1"], lens: Distortion | None) -> View:
-        """A view on the device; of its lens, the coefficients are read there."""
-        of_views = (self._viewmats, self._Ks, self._times, self.mask_trust, self._coefficients)
-        viewmat, K, time, mask_trust, k = (values.index_select(0, index)[0] for values in of_views)
-        distortion = None if lens is None else replace(lens, coefficients=k[: len(lens.coefficients)])
-        motion = None if self._motions is None else self._motions.index_select(0, index)[0]
+        """A view on the device."""
+        time, mask_trust = (values.index_select(0, index)[0] for values in (self._times, self.mask_trust))
         height, width = pixels.static_mask.shape
         image = pixels.image.float() / 255.0
         return View(
-            self._corrected(Camera(viewmat, K, width, height, distortion=distortion, motion=motion), index),
+            self._corrected(self._cameras.at(index, lens, (width, height)), index),
             time,
             image if self._gains is None else image / self._gains.index_select(0, index)[0],
             pixels.static_mask,

@@ -61,7 +61,7 @@ def seen_from(
         The image, and which of its pixels the given image has.
     """
     camera, taken = camera.to("cpu"), taken.to("cpu")
-    viewed = camera.rays(camera.pixel_centers) @ camera.viewmat[:3, :3] @ taken.viewmat[:3, :3].T
+    viewed = camera.rays(camera.pixel_centers) @ (camera.viewmat[:3, :3] @ taken.viewmat[:3, :3].T)
     positions, _, is_seen = taken.place(viewed)
     is_seen &= ((positions >= 0.0) & (positions <= torch.tensor(taken.size))).all(1)
     # OpenCV has pixel centres at integers.

@@ -14,8 +14,9 @@ from warpgs.prepare.cameras.intrinsics import read_intrinsics
 
 K = np.array([[500.0, 0.0, 319.5], [0.0, 510.0, 239.5], [0.0, 0.0, 1.0]])
 BENT = np.array([0.1, -0.02, 0.001, -0.002, 0.003])
-LENS = Lens(640, 480, (500.0, 510.0), (320.0, 240.0), (0.1, -0.02, 0.003), (0.001, -0.002))
-FISHEYE = Lens(640, 480, (300.0, 310.0), (320.0, 240.0), fisheye=(0.1, -0.02, 0.001, -0.002))
+LENS = Lens(640, 480, (500.0, 510.0), (320.0, 240.0), (0.1, -0.02, 0.001, -0.002, 0.003))
+RATIONAL = Lens(640, 480, (500.0, 510.0), (320.0, 240.0), (0.1, -0.02, 0.001, -0.002, 0.003, 0.04, 0.01, 0.002))
+FISHEYE = Lens(640, 480, (300.0, 310.0), (320.0, 240.0), (0.1, -0.02, 0.001, -0.002), "fisheye")
 
 ROS = """image_width: 640
 image_height: 480
@@ -54,10 +55,10 @@ def test_lists_without_a_size_are_of_the_frames(tmp_path):
     assert read_intrinsics(path, (640, 480)) == LENS
     assert read_intrinsics(path, (700, 500)).width == 700
     path.write_text(json.dumps({"camera_matrix": K.tolist(), "fisheye_model": 1}))
-    assert read_intrinsics(path).fisheye == (0.0, 0.0, 0.0, 0.0)
+    assert read_intrinsics(path).model == "fisheye"
 
 
-@pytest.mark.parametrize("lens", [LENS, FISHEYE, Lens(640, 480, (500.0, 500.0), (320.0, 240.0), (0.1, 0.0, 0.0))])
+@pytest.mark.parametrize("lens", [LENS, FISHEYE, Lens(640, 480, (500.0, 500.0), (320.0, 240.0), (0.1,)), RATIONAL])
 def test_cameras_of_colmap_are_read_and_written(tmp_path, lens):
     model, params = parameters_of_lens(lens)
     assert lens_of_parameters(model, (640, 480), params) == lens
@@ -75,9 +76,9 @@ REFUSED = [
     ("a.json", '{"camera_matrix": "x"}', "must hold numbers"),
     ("a.json", json.dumps({"camera_matrix": [[500, 1, 3], [0, 500, 3], [0, 0, 1]]}), "must have no skew, got 1"),
     ("a.json", json.dumps({"camera_matrix": (-K).tolist()}), "focal lengths must be at least"),
-    ("a.json", json.dumps({**MATRIX, "distortion_coefficients": [0.1] * 8}), "may have k1, k2, p1, p2, k3, got"),
+    ("a.json", json.dumps({**MATRIX, "distortion_coefficients": [0.1] * 9}), "may have k1, k2, p1, p2, k3 to k6, got"),
     ("a.json", json.dumps({**MATRIX, "image_width": 640}), "has no image_height"),
-    ("a.json", json.dumps({**MATRIX, "distortion_coefficients": [-9.0]}), "too strong to undistort"),
+    ("a.json", json.dumps({**MATRIX, "distortion_coefficients": [-9.0]}), "folds back inside the image"),
     ("a.json", json.dumps({**MATRIX, "image_width": 480, "image_height": 640}), "480×640, the source's frames are"),
     ("a.yaml", "camera_matrix: [1, 2\n  x: }", "is not a file of OpenCV"),
     ("a.xml", "<a>", "a.xml"),

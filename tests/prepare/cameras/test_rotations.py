@@ -11,7 +11,7 @@ from warpgs.prepare.cameras import rotations
 from warpgs.prepare.cameras.recovered import NoCamerasError
 from warpgs.prepare.cameras.rotations import find_directions
 
-TRUE = Lens(640, 480, (420.0, 420.0), (320.0, 240.0), (-0.08, 0.0, 0.0))
+TRUE = Lens(640, 480, (420.0, 420.0), (320.0, 240.0), (-0.08,))
 UNKNOWN = Lens(640, 480, (1.0, 1.0), (320.0, 240.0))
 NAMES = [f"frame_{k:06d}" for k in range(14)]
 
@@ -50,7 +50,7 @@ def test_directions_focal_length_and_distortion_are_found_despite_moving_objects
     found = find_directions(NAMES, matches(outliers), UNKNOWN, finds_focal=True, finds_distortion=True)
     assert found.names == NAMES
     assert abs(found.lens.focal[0] / TRUE.focal[0] - 1.0) < 0.01
-    assert abs(found.lens.radial[0] - TRUE.radial[0]) < 0.02
+    assert abs(found.lens.coefficients[0] - TRUE.coefficients[0]) < 0.02
     assert errors(found).max() < 0.3
     assert found.error < 1.0
     assert not found.have_parallax
@@ -85,10 +85,10 @@ def test_frames_without_matches_are_refused():
 
 
 def test_an_impossible_lens_is_refused_with_what_to_give(monkeypatch):
-    impossible = dataclasses.replace(TRUE, radial=(-3.0, 0.0, 0.0))  # lines through the middle fold back
+    impossible = dataclasses.replace(TRUE, coefficients=(-3.0,))  # lines through the middle fold back
     solve = rotations._Problem.solve
     monkeypatch.setattr(rotations._Problem, "solve", lambda problem, start: (solve(problem, start)[0], impossible))
     monkeypatch.setattr(rotations, "_checked_error", lambda residuals: 0.3)
-    advice = r"too strong to undistort.*--focal PX.*--intrinsics FILE.*--lens SIMPLE_PINHOLE"
+    advice = r"folds back inside the image.*--focal PX.*--intrinsics FILE.*--lens SIMPLE_PINHOLE"
     with pytest.raises(NoCamerasError, match=advice):
         find_directions(NAMES, matches(), UNKNOWN, finds_focal=True, finds_distortion=True)

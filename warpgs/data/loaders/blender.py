@@ -42,7 +42,7 @@ class BlenderLoader:
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_with``."""
         evaluated = next((root / name for name in (TEST, VAL) if (root / name).is_file()), None)
-        indices = [Transforms(path, options.undistort) for path in (root / TRAIN, evaluated) if path is not None]
+        indices = [Transforms(path) for path in (root / TRAIN, evaluated) if path is not None]
         train, *others = (_frames(index, index.path.stem.split("_")[1]) for index in indices)
         val = [frame for frames in others for frame in frames]
         frames = [*train, *val]

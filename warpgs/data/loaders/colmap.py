@@ -41,7 +41,7 @@ class ColmapLoader:
         found, notes = largest_model(root)
         if found is None:
             raise ValueError(f"{root} has no folder images/ with a COLMAP model in {PLACES}")
-        model = load_model(found.folder, options.undistort)
+        model = load_model(found.folder)
         files = _Files(found.part, options.factor or 1)
         images = sorted(model.images, key=lambda image: natural_order(files.stored_name(image)))
         stored_names = [files.stored_name(image) for image in images]

@@ -17,8 +17,8 @@ class HyperNerfLoader(NerfiesLoader):
     default_factor = 2
 
     def load(self, root: Path, options: LoadOptions, incomplete_masks: bool = False) -> Capture:
-        """Opens a capture; Deformable-3DGS, which does not undistort, reads those of two cameras at a factor of 4."""
-        if options.factor is None and not options.undistort and self.is_vrig(root):
+        """Opens a capture; Deformable-3DGS, without distortion, reads those of two cameras at a factor of 4."""
+        if options.factor is None and not options.distortion and self.is_vrig(root):
             options = replace(options, factor=4)
         return super().load(root, options, incomplete_masks)
 

@@ -184,7 +184,7 @@ def _world(root: Path, poses: Float[np.ndarray, "N 3 4"], bounds: Float[np.ndarr
     if models := _models(root):
         # Several models have unrelated worlds: the poses come from the one with as many images.
         folder = next((model.folder for model in models if model.num_images() == len(poses)), models[0].folder)
-        _, points, colors, notes = load_model(folder, undistort=False)
+        _, points, colors, notes = load_model(folder)
         if len(points):
             return World(points, colors, notes=notes, conventions=WHITE_IS_DYNAMIC)
     centers = -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3])

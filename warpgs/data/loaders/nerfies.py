@@ -22,10 +22,9 @@ from warpgs.config import MaskPerturbation
 from warpgs.data import images
 from warpgs.data.camera_files import read_camera
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.lens import Lens, undistort
+from warpgs.data.lens import Lens
 from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
-from warpgs.data.taken import taken_reader
 from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.data.writer import ESTIMATED, GIVEN, is_plain_id
@@ -94,7 +93,7 @@ class NerfiesLoader(ABC):
         cameras, lenses = {}, {}
         for name, time in times.items():
             path = find_file(root / "camera", f"{name}.json") or root / f"camera/{name}.json"
-            cameras[name], lenses[name] = read_camera(path, units, factor, time, options.lens)
+            cameras[name], lenses[name] = read_camera(path, units, factor, time, options.distortion)
         points, colors = read_points(root, units)
         read_depth = partial(_read_depth, self, units)
         reader = _FrameReader(cameras, lenses, files, frozenset(split.train), options.perturbation, read_depth)
@@ -111,7 +110,6 @@ class NerfiesLoader(ABC):
             options.cache_frames,
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
             estimated_masks=_are_estimates(root / "dataset.json", dataset) and any(f.mask for f in files.values()),
-            read_taken=taken_reader(reader.read_with, lenses),
             time_source=time_source,
             notes=[
                 *turning_notes([files[name].image for name in cameras], [camera.size for camera in cameras.values()]),
@@ -254,14 +252,10 @@ class _FrameReader:
     read_depth: Callable[[Path, tuple[int, int], Path], np.ndarray]
 
     def read(self, name: str) -> Frame:
-        return self.read_with(name, self.lenses[name])
-
-    def read_with(self, name: str, lens: Lens) -> Frame:
-        """The frame, undistorted as for a lens."""
         files, size = self.files[name], self.cameras[name].size
 
         def optional(read: Callable[[Path, tuple[int, int], Path], np.ndarray], path: Path | None) -> np.ndarray | None:
-            return None if path is None else undistort(read(path, size, files.image), lens)
+            return None if path is None else read(path, size, files.image)
 
         mask = optional(images.read_mask, files.mask)
         if mask is not None and name in self.train:
@@ -270,8 +264,8 @@ class _FrameReader:
         return Frame(
             name,
             self.cameras[name],
-            torch.from_numpy(undistort(images.read_image(files.image, size), lens)),
+            torch.from_numpy(images.read_image(files.image, size)),
             None if mask is None else torch.from_numpy(mask),
-            None if depth is None else torch.from_numpy(depth),
+            None if depth is None else torch.from_numpy(depth * self.lenses[name].axial_depths()),
             None if covisible is None else torch.from_numpy(covisible),
         )

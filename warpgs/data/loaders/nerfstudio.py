@@ -42,7 +42,7 @@ class NerfstudioLoader:
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_with``."""
-        transforms = Transforms(root / INDEX, options.undistort)
+        transforms = Transforms(root / INDEX)
         entries = sorted(transforms.frames, key=lambda entry: natural_order(transforms.image_name(entry)))
         images = [transforms.image(entry) for entry in entries]
         names = plain_names([transforms.image_name(entry) for entry in entries])

@@ -17,10 +17,9 @@ from warpgs.config import Background, MaskPerturbation
 from warpgs.data.camera_files import MAX_ROTATION_ERROR, is_rotation
 from warpgs.data.capture import Assumption, Capture, Conventions, Frame
 from warpgs.data.depth_points import DepthView, points_of_views
-from warpgs.data.lens import Lens, pinhole_matrix, undistort
+from warpgs.data.lens import Lens
 from warpgs.data.masks import perturb
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.data.taken import taken_reader, without_distortion
 from warpgs.data.time_source import TimeSource
 from warpgs.data.units import SceneUnits, scene_units, units_around
 from warpgs.files import MAX_NUMBER
@@ -52,7 +51,7 @@ class PosedFrame:
         time: Time in any unit.
         image: Reads the RGB image in a size; a fourth channel is 0 where it shows the world's background alone.
         static_mask: Reads the static mask; None if the frame has none.
-        inverse_depth: Reads inverse depth, NaN where unknown; None if the frame has none.
+        inverse_depth: Reads inverse depth along the optical axis, NaN where unknown; None if the frame has none.
     """
 
     name: str
@@ -111,9 +110,9 @@ def posed_capture(
         ValueError: If there are no frames, two have one name, or a camera is invalid.
     """
     _check_names(root, [frame.name for frame in frames])
-    frames = frames if options.depth else [replace(frame, inverse_depth=None) for frame in frames]
+    frames = [_as_asked(frame, options) for frame in frames]
     by_name = {frame.name: frame for frame in frames}
-    points, colors = _points(world, frames, options.undistort)
+    points, colors = _points(world, frames)
     units = world.units or _units(frames, points)
     cameras, lenses = _cameras(root, frames, units, world.own_times, options)
     train, evaluated = ([name for name in by_name if (name in val) == is_val] for is_val in (False, True))
@@ -128,7 +127,6 @@ def posed_capture(
         reader.read,
         options.cache_frames,
         world.assumption,
-        read_taken=taken_reader(reader.read_with, lenses),
         background=world.background,
         notes=world.notes,
         time_source=world.time_source,
@@ -136,10 +134,16 @@ def posed_capture(
     )
 
 
+def _as_asked(frame: PosedFrame, options: LoadOptions) -> PosedFrame:
+    """The frame without its depth or the distortion of its lens, if they are not asked for."""
+    frame = frame if options.depth else replace(frame, inverse_depth=None)
+    return frame if options.distortion else replace(frame, lens=replace(frame.lens, coefficients=(), model="radial"))
+
+
 def _points(
-    world: World, frames: Sequence[PosedFrame], undistorted: bool
+    world: World, frames: Sequence[PosedFrame]
 ) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
-    return points_of_depth(frames, undistorted) if world.points is None else (world.points, world.colors)
+    return points_of_depth(frames) if world.points is None else (world.points, world.colors)
 
 
 def _units(frames: Sequence[PosedFrame], points: Float[np.ndarray, "P 3"]) -> SceneUnits:
@@ -164,12 +168,13 @@ def _check_names(root: Path, names: Sequence[str]) -> None:
 def _cameras(
     root: Path, frames: Sequence[PosedFrame], units: SceneUnits, own_times: bool, options: LoadOptions
 ) -> tuple[dict[str, Camera], dict[str, Lens]]:
-    """The pinhole camera of each frame, and the lens of its distorted image."""
+    """The camera of each frame, and the lens of its image."""
     times = [frame.time for frame in frames]
     start, length = (0.0, 1.0) if own_times else (min(times), (max(times) - min(times)) or 1.0)
     cameras, lenses = {}, {}
     for frame in frames:
-        lenses[frame.name] = options.lens(reduced(frame.lens, options.factor or 1))
+        lens = reduced(frame.lens, options.factor or 1)
+        lenses[frame.name] = lens if options.distortion else lens.centered_pinhole
         try:
             cameras[frame.name] = _camera(frame, lenses[frame.name], units, (frame.time - start) / length)
         except ValueError as error:
@@ -233,36 +238,28 @@ def _joined(paths: Sequence[str]) -> list[str]:
 
 
 def points_of_depth(
-    frames: Sequence[PosedFrame], undistorted: bool = True
+    frames: Sequence[PosedFrame],
 ) -> tuple[Float[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
     """Points and their colours from frames whose depth has the units of their cameras; none without depth.
 
-    Args:
-        frames: The frames.
-        undistorted: Whether to undistort the frames first; if not, they are taken as those of pinhole cameras.
-
     Raises:
-        ValueError: If a file of a frame is missing or damaged.
+        ValueError: If a file of a frame is missing or damaged, or a lens folds back inside its image.
     """
     known = [frame for frame in frames if frame.inverse_depth is not None]
     chosen = evenly_spaced_indices(len(known), MAX_DEPTH_FRAMES)
-    return points_of_views([_depth_view(known[k], undistorted) for k in chosen])
+    return points_of_views([_depth_view(known[k]) for k in chosen])
 
 
-def _depth_view(frame: PosedFrame, undistorted: bool) -> DepthView:
+def _depth_view(frame: PosedFrame) -> DepthView:
     assert frame.inverse_depth is not None
-    lens = frame.lens if undistorted else without_distortion(frame.lens)
-    lens = reduced(lens, max(1, round(max(lens.width, lens.height) / DEPTH_SIDE)))
+    lens = reduced(frame.lens, max(1, round(max(frame.lens.width, frame.lens.height) / DEPTH_SIDE)))
     size = lens.width, lens.height
     static = np.ones(size[::-1], bool) if frame.static_mask is None else frame.static_mask(size)
-    parts = (undistort(part, lens) for part in (frame.image(size)[..., :3], frame.inverse_depth(size), static))
-    image, inverse_depth, static = parts
-    return DepthView(image, inverse_depth, static, pinhole_matrix(lens), frame.pose)
+    return DepthView(frame.image(size)[..., :3], frame.inverse_depth(size), static, lens, frame.pose)
 
 
 def _camera(frame: PosedFrame, lens: Lens, units: SceneUnits, time: float) -> Camera:
-    K, center = pinhole_matrix(lens.checked()), units.from_world(frame.center)
-    camera = Camera.posed(frame.pose[:, :3], center, K, (lens.width, lens.height), time)
+    camera = lens.checked().camera(frame.pose[:, :3], units.from_world(frame.center), time)
     if not camera.viewmat.isfinite().all():
         raise ValueError("the pose is not finite in scene units")
     if not 0.0 <= time <= 1.0:
@@ -282,22 +279,17 @@ class _FrameReader:
     perturbation: MaskPerturbation
 
     def read(self, name: str) -> Frame:
-        return self.read_with(name, self.lenses[name])
-
-    def read_with(self, name: str, lens: Lens) -> Frame:
-        """The frame, undistorted as for a lens."""
         frame, size = self.frames[name], self.cameras[name].size
         stored = frame.image(size)
-        image = undistort(np.ascontiguousarray(stored[..., :3]), lens)
-        empty = None if stored.shape[2] < 4 else torch.from_numpy(undistort(stored[..., 3] == 0, lens))
-        mask = None if frame.static_mask is None else undistort(frame.static_mask(size), lens)
+        empty = None if stored.shape[2] < 4 else torch.from_numpy(stored[..., 3] == 0)
+        mask = None if frame.static_mask is None else frame.static_mask(size)
         if mask is not None and name in self.train:
             mask = perturb(mask, self.perturbation, name)
-        depth = None if frame.inverse_depth is None else undistort(frame.inverse_depth(size), lens)
+        depth = None if frame.inverse_depth is None else frame.inverse_depth(size) * self.lenses[name].axial_depths()
         return Frame(
             name,
             self.cameras[name],
-            torch.from_numpy(np.require(image, requirements=("C", "W"))),
+            torch.from_numpy(np.require(stored[..., :3], requirements=("C", "W"))),
             None if mask is None else torch.from_numpy(mask),
             None if depth is None else torch.from_numpy(depth / np.float32(self.scale)),
             empty=empty,

@@ -67,7 +67,6 @@ class Transforms:
 
     Args:
         path: The file.
-        undistort: Whether images are to be undistorted; if not, lenses may distort too strongly for that.
 
     Attributes:
         path: The file.
@@ -78,8 +77,8 @@ class Transforms:
         ValueError: If the file is missing, damaged or without frames, or its camera model is not supported.
     """
 
-    def __init__(self, path: Path, undistort: bool) -> None:
-        self.path, self._undistort = path, undistort
+    def __init__(self, path: Path) -> None:
+        self.path = path
         fields = read_json(path)
         has_focal = any(key in fields for key in FOCAL)
         self.fields = with_intrinsics(path, fields, has_focal)
@@ -203,13 +202,13 @@ class Transforms:
         focal_y = self._focal(frame, "fl_y", "camera_angle_y", height)
         center = self._number(frame, "cx", width / 2), self._number(frame, "cy", height / 2)
         k1, k2, k3, k4, p1, p2 = (self._number(frame, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-        lens = Lens(width, height, (focal, focal_y or focal), center, (k1, k2, k3), (p1, p2))
+        lens = Lens(width, height, (focal, focal_y or focal), center, (k1, k2, p1, p2, k3))
         if self._model(frame) == FISHEYE:
-            lens = replace(lens, radial=(0.0, 0.0, 0.0), tangential=(0.0, 0.0), fisheye=(k1, k2, k3, k4))
+            lens = replace(lens, coefficients=(k1, k2, k3, k4), model="fisheye")
         elif k4:
             raise ValueError(f"{self.path}: k4 must be 0, got {k4}; undistort the images first")
         try:
-            return lens.checked(self._undistort)
+            return lens.checked()
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 

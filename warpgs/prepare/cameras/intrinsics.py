@@ -9,7 +9,6 @@ measures pixels from the centre of the first one, half a pixel from the corner, 
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from warpgs.data.colmap import lens_of_parameters
-from warpgs.data.lens import Lens
+from warpgs.data.lens import Lens, LensModel
 from warpgs.files import read_bounded, read_json, read_numbers
 from warpgs.parsed import reason
 
@@ -46,13 +45,17 @@ def read_intrinsics(path: Path, size: tuple[int, int] | None = None) -> Lens:
             of another size and the same aspect ratio.
 
     Raises:
-        ValueError: If the file is missing or damaged, its camera model cannot be represented, or it is of images of
-            another aspect ratio.
+        ValueError: If the file is missing or damaged, its camera model cannot be represented, its lens folds back
+            inside the image, or it is of images of another aspect ratio.
     """
     suffix = path.suffix.lower()
     if suffix != ".txt" and suffix not in READERS:
         raise ValueError(f"{path}: intrinsics are read from files that end with {', '.join(('.txt', *READERS))}")
     lens = _of_colmap(path) if suffix == ".txt" else _of_opencv(path, READERS[suffix](path), size)
+    try:
+        _ = lens.distortion
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     if size is None:
         return lens
     width, height = size
@@ -160,18 +163,17 @@ def _of_opencv(path: Path, fields: dict[str, Any], size: tuple[int, int] | None)
     if skew:
         raise ValueError(f"{path}: cameras must have no skew, got {skew}")
     is_fisheye = fields.get("distortion_model") in ("equidistant", "fisheye") or bool(fields.get("fisheye_model"))
-    max_count, meaning = (4, "k1 to k4") if is_fisheye else (5, "k1, k2, p1, p2, k3")
+    max_count, meaning = (4, "k1 to k4") if is_fisheye else (8, "k1, k2, p1, p2, k3 to k6")
     distortion = _numbers(path, {DISTORTION: [], **fields}, DISTORTION)
     if distortion[max_count:].any():
         raise ValueError(f"{path}: {DISTORTION} may have {meaning}, got {distortion.tolist()}")
-    k1, k2, a, b, k3 = [*distortion[:max_count].tolist(), *[0.0] * 5][:5]
     if "image_width" in fields or "image_height" in fields:
         size = round(_number(path, fields, "image_width")), round(_number(path, fields, "image_height"))
     width, height = size or (round(2.0 * cx) + 1, round(2.0 * cy) + 1)  # only to check the file: no frames yet
-    plain = Lens(width, height, (fx, fy), (cx + 0.5, cy + 0.5))
-    perspective = replace(plain, radial=(k1, k2, k3), tangential=(a, b))
+    coefficients = tuple(distortion.tolist())
+    model: LensModel = "fisheye" if is_fisheye else "radial"
     try:
-        return (replace(plain, fisheye=(k1, k2, a, b)) if is_fisheye else perspective).checked()
+        return Lens(width, height, (fx, fy), (cx + 0.5, cy + 0.5), coefficients, model).checked()
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

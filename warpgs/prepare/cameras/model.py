@@ -45,6 +45,7 @@ def cameras_of_model(model: Any, names: list[str], weak_features: bool) -> Camer
     poses = np.array([i.cam_from_world().matrix() for i in images])
     try:
         lens = lens_of(images[0].camera)
+        _ = lens.distortion
     except ValueError as error:
         raise NoCamerasError(f"the lens that was found is wrong ({error}): give it (--focal, --intrinsics)") from error
     points = [p for p in model.points3D.values() if p.track.length() >= 3 and p.error <= MAX_ERROR]

@@ -1,6 +1,5 @@
 """Cameras and sparse points as structure from motion recovers them."""
 
-import dataclasses
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from warpgs.data.archive import Archive
-from warpgs.data.lens import Lens, pinhole_matrix
+from warpgs.data.lens import Lens
 from warpgs.files import DAMAGED_ARRAY
 
 MAX_BYTES = 1 << 30
@@ -81,18 +80,15 @@ class Cameras:
         """Whether they are at different places."""
         return are_apart(self.centers)
 
-    def undistorted(self) -> "Cameras":
-        """The cameras of the undistorted frames."""
-        return dataclasses.replace(self, lens=pinhole_lens(self.lens))
-
     def save(self, path: Path) -> None:
         """Writes <path>.npz."""
         lens = self.lens
         np.savez(
             f"{path}.npz",
             names=np.array(self.names),
-            lens=np.array([lens.width, lens.height, *lens.focal, *lens.center, *lens.radial, *lens.tangential]),
-            fisheye=np.array(lens.fisheye or ()),
+            lens=np.array([lens.width, lens.height, *lens.focal, *lens.center]),
+            coefficients=np.array(lens.coefficients),
+            is_fisheye=np.array(lens.model == "fisheye"),
             poses=self.poses,
             points=self.points,
             quality=np.array([self.error, self.angle]),
@@ -125,10 +121,15 @@ class Cameras:
 
     @staticmethod
     def _parse(z: Mapping[str, np.ndarray]) -> "Cameras":
-        v = z["lens"].tolist()
-        lens = Lens(int(v[0]), int(v[1]), (v[2], v[3]), (v[4], v[5]), (v[6], v[7], v[8]), (v[9], v[10]))
-        if len(fisheye := z["fisheye"].tolist()):
-            lens = dataclasses.replace(lens, fisheye=(fisheye[0], fisheye[1], fisheye[2], fisheye[3]))
+        width, height, fx, fy, cx, cy = z["lens"].tolist()
+        lens = Lens(
+            int(width),
+            int(height),
+            (fx, fy),
+            (cx, cy),
+            tuple(z["coefficients"].tolist()),
+            "fisheye" if z["is_fisheye"] else "radial",
+        )
         error, angle = z["quality"].tolist()
         flags = map(bool, z["flags"])
         return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, *flags)
@@ -137,8 +138,3 @@ class Cameras:
 def camera_centers(poses: Float[np.ndarray, "F 3 4"]) -> Float[np.ndarray, "F 3"]:
     """[F, 3] centres of cameras of world-to-camera poses."""
     return -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3])
-
-
-def pinhole_lens(lens: Lens) -> Lens:
-    """The pinhole lens of the images that ``undistort`` makes."""
-    return Lens.pinhole(pinhole_matrix(lens), (lens.width, lens.height))

@@ -46,6 +46,9 @@ SCALE = 1.0
 MAX_STEPS, MIN_DECREASE = 60, 1e-7
 """Maximum number of Levenberg-Marquardt steps, and the relative decrease of the loss below which they end."""
 
+FOLDED = 1e6
+"""Distance that stands for all with a lens that folds back [px]."""
+
 STEP = 1e-6
 """Step of numerical derivatives."""
 
@@ -104,7 +107,7 @@ def _checked_error(residuals: Float[np.ndarray, "M 2"]) -> float:
 def _check_lens(lens: Lens) -> None:
     """Refuses a lens that no camera has; what the matches leave open can become anything."""
     try:
-        lens.checked()
+        _ = lens.checked().distortion
     except ValueError as error:
         raise NoCamerasError(
             f"the matches determine no possible lens: {error}; give the focal length (--focal PX) or the whole lens "
@@ -196,15 +199,22 @@ class _Problem:
         return state(minimize(problem, unchanged, MAX_STEPS, MIN_DECREASE))
 
     def residuals(self, rotations: Float[np.ndarray, "F 3 3"], lens: Lens) -> Float[np.ndarray, "M 2"]:
-        """[M, 2] distances of the positions in b from where the rotations move those in a [px]."""
+        """[M, 2] distances of the positions in b from where the rotations move those in a [px].
+
+        Of a lens that folds back, which no camera has, they are very large.
+        """
+        try:
+            _ = lens.distortion
+        except ValueError:
+            return np.full_like(self.seen_b, FOLDED)
         return self._project(self._turned(rotations, lens), lens) - self.seen_b
 
     def _lens(self, changes: np.ndarray) -> Lens:
         values = dict(zip(self.free, changes.tolist(), strict=True))
         factor = float(np.exp(values.get("focal", 0.0)))
         focal = self.lens.focal[0] * factor, self.lens.focal[1] * factor
-        k1, k2, k3 = self.lens.radial
-        return dataclasses.replace(self.lens, focal=focal, radial=(k1 + values.get("distortion", 0.0), k2, k3))
+        k1, *others = self.lens.coefficients or (0.0,)
+        return dataclasses.replace(self.lens, focal=focal, coefficients=(k1 + values.get("distortion", 0.0), *others))
 
     def _turned(self, rotations: np.ndarray, lens: Lens) -> Float[np.ndarray, "M 3"]:
         inward = np.einsum("mji,mj->mi", rotations[self.a], lens.unit_rays(self.seen_a))

@@ -24,7 +24,7 @@ def points_around(
     """[P, 3] points in static regions, evenly spread over the frames.
 
     Args:
-        cameras: Cameras at the origin, with a pinhole lens.
+        cameras: Cameras at the origin.
         dynamic: [H, W] dynamic mask of each.
         planes: [h, w] inverse depth of each frame, in any size; each frame's median is at distance 1, and frames
             without any give no points. If None, all points are at distance 1: nothing tells another one.

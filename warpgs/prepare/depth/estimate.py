@@ -61,7 +61,7 @@ def add_depth(
     Raises:
         OSError: If a file cannot be written; the message names it.
     """
-    frames = load_posed_frames(root / "rgb/1x", cameras.undistorted(), MAX_SIDE, max_factor=1.0)
+    frames = load_posed_frames(root / "rgb/1x", cameras, MAX_SIDE, max_factor=1.0)
     folder = find_weights(method.network, weights)
     dynamic = _dynamic_masks(root, cameras, (frames.lens.width, frames.lens.height))
     planes = method.estimate(frames, dynamic, folder, quiet)
@@ -84,11 +84,10 @@ def depth_files(root: Path, names: Sequence[str]) -> list[Path]:
 
 def _place_points(root: Path, cameras: Cameras, planes: Planes) -> None:
     """Writes the points of a camera that stays at one place as far away as its depth says, if it says anything."""
-    pinhole = cameras.undistorted()
     masks = list(_dynamic_masks(root, cameras, (cameras.lens.width, cameras.lens.height)))
-    points = points_around(pinhole, masks, planes)
+    points = points_around(cameras, masks, planes)
     if len(points):
-        write_world(root, dataclasses.replace(pinhole, points=points))
+        write_world(root, dataclasses.replace(cameras, points=points))
 
 
 def _dynamic_masks(root: Path, cameras: Cameras, size: tuple[int, int]) -> Iterator[Bool[np.ndarray, "H W"]]:

@@ -8,13 +8,12 @@ import numpy as np
 from jaxtyping import Bool
 
 from warpgs.data.images import read_mask
-from warpgs.data.lens import undistort
 from warpgs.files import read_json, write_json, write_png
 
 from ..cameras.recovered import Cameras
 
 INDEX = "masks.json"
-"""Index of the masks in their folder, with ``dynamic_fraction`` and ``undistorted``."""
+"""Index of the masks in their folder, with ``dynamic_fraction``."""
 
 
 @dataclass(frozen=True)
@@ -24,33 +23,29 @@ class Masks:
     Attributes:
         folder: Folder of the files; None if nothing is dynamic.
         dynamic_fraction: Fraction of the pixels that are dynamic.
-        undistorted: Whether the masks belong to undistorted frames. COLMAP uses them with the frames all the same:
-            features a few pixels from the outlines do no harm.
         estimated: Whether a method of ``MASKERS`` found them, instead of the user giving them.
     """
 
     folder: Path | None = None
     dynamic_fraction: float = 0.0
-    undistorted: bool = False
     estimated: bool = False
 
     @staticmethod
     def load(folder: Path) -> "Masks":
         """The masks that ``write_masks`` wrote."""
         index = read_json(folder / INDEX)
-        return Masks(folder, float(index["dynamic_fraction"]), bool(index["undistorted"]))
+        return Masks(folder, float(index["dynamic_fraction"]))
 
     def read_dynamic(self, cameras: Cameras) -> list[Bool[np.ndarray, "H W"]]:
-        """[H, W] the dynamic mask of each undistorted frame of the cameras, in the size of the lens.
+        """[H, W] the dynamic mask of each frame of the cameras, in the size of the lens.
 
         Raises:
             ValueError: If a file was damaged since it was written.
         """
-        lens, size = cameras.lens, (cameras.lens.width, cameras.lens.height)
+        size = cameras.lens.width, cameras.lens.height
         if self.folder is None:
             return [np.zeros(size[::-1], bool) for _ in cameras.names]
-        masks = (~read_mask(self.folder / f"{name}.png.png", size) for name in cameras.names)
-        return [mask if self.undistorted else undistort(mask, lens) for mask in masks]
+        return [~read_mask(self.folder / f"{name}.png.png", size) for name in cameras.names]
 
 
 def mask_files(folder: Path, names: Sequence[str]) -> list[Path]:
@@ -58,9 +53,7 @@ def mask_files(folder: Path, names: Sequence[str]) -> list[Path]:
     return [folder / INDEX, *(folder / f"{name}.png.png" for name in names)]
 
 
-def write_masks(
-    folder: Path, names: Sequence[str], dynamic: Sequence[Bool[np.ndarray, "H W"]], undistorted: bool = False
-) -> str:
+def write_masks(folder: Path, names: Sequence[str], dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> str:
     """Writes the masks of the frames; returns a summary.
 
     Raises:
@@ -69,5 +62,5 @@ def write_masks(
     for name, mask in zip(names, dynamic, strict=True):
         write_png(folder / f"{name}.png.png", (~mask).astype(np.uint8) * 255)
     fraction = float(np.mean([mask.mean() for mask in dynamic]))
-    write_json(folder / INDEX, {"dynamic_fraction": fraction, "undistorted": undistorted})
+    write_json(folder / INDEX, {"dynamic_fraction": fraction})
     return f"{fraction:.1%} of the pixels move"

@@ -1,8 +1,4 @@
-"""Masks given by the user: a folder of PNG files, 0 = dynamic.
-
-Masks named like the source's files belong to these. Masks named like a capture's frames were drawn over the frames of a
-capture, which are undistorted.
-"""
+"""Masks given by the user: a folder of PNG files, 0 = dynamic, named like the source's files or a capture's frames."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,8 +15,8 @@ SUFFIXES = (".png", ".png.png")
 """Suffixes of mask files; captures use the second."""
 
 
-def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> tuple[list[Path], bool]:
-    """The mask of every frame, and whether they are named like the capture's frames. All must be named the same way.
+def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> list[Path]:
+    """The mask of every frame. All must be named the same way.
 
     Raises:
         ValueError: If one is missing.
@@ -36,7 +32,7 @@ def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> tuple[list[
         frame = frames[found.index(None)]
         name = frame.name if found is as_frames else Path(frame.source).stem
         raise ValueError(f"{folder} has no mask for {frame.name} ({frame.source}): expected {name}.png")
-    return [path for path in found if path is not None], found is as_frames
+    return [path for path in found if path is not None]
 
 
 def read_dynamic(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:

@@ -1,0 +1,52 @@
+"""The cameras of views as tensors on the device, from which CUDA graphs read the one that is selected there."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from warpgs.cameras import Camera
+from warpgs.distortion import Distortion
+
+
+class StackedCameras:
+    """Cameras whose lenses may differ.
+
+    Attributes:
+        lenses: The lens of each camera; None for a pinhole.
+    """
+
+    lenses: list[Distortion | None]
+
+    def __init__(self, cameras: Sequence[Camera], device: torch.device) -> None:
+        self._viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device)
+        self._Ks = torch.stack([camera.K for camera in cameras]).to(device)
+        self.lenses = [camera.distortion for camera in cameras]
+        none, still = torch.zeros(0, dtype=torch.float32), torch.zeros(2, 3, dtype=torch.float32)
+        coefficients = [none if lens is None else lens.coefficients for lens in self.lenses]
+        self._coefficients = pad_sequence(coefficients, batch_first=True).to(device)
+        motions = [still if camera.motion is None else camera.motion for camera in cameras]
+        have_motion = any(camera.motion is not None for camera in cameras)
+        self._motions = torch.stack(motions).to(device) if have_motion else None
+
+    @property
+    def have_one_lens(self) -> bool:
+        """Whether all lenses are of one kind and limit, which are constants of a CUDA graph."""
+        return len({None if lens is None else (lens.lens, lens.limit) for lens in self.lenses}) == 1
+
+    def at(self, index: Int64[Tensor, "1"], lens: Distortion | None, size: tuple[int, int]) -> Camera:
+        """The camera of an index on the device, at time 0.
+
+        Args:
+            index: The index.
+            lens: Its lens, of which only the coefficients are read from the device.
+            size: (width, height) of its image [px].
+        """
+        of_cameras = (self._viewmats, self._Ks, self._coefficients)
+        viewmat, K, k = (values.index_select(0, index)[0] for values in of_cameras)
+        distortion = None if lens is None else replace(lens, coefficients=k[: len(lens.coefficients)])
+        motion = None if self._motions is None else self._motions.index_select(0, index)[0]
+        return Camera(viewmat, K, *size, distortion=distortion, motion=motion)
