@@ -8,11 +8,13 @@ import torch
 
 from tests import tiny
 from tests.data.captures import ids_of, write_capture
+from tests.scenes import along_z
 from warpgs.captures.opening import load_capture
 from warpgs.data.capture import Capture
 from warpgs.distortion import Distortion
 from warpgs.model.poses import PoseCorrections
 from warpgs.views.pixels import mask_border
+from warpgs.views.stacked_cameras import StackedCameras
 from warpgs.views.views import Views
 
 CPU = torch.device("cpu")
@@ -49,6 +51,24 @@ def assert_same(a, b):
     assert torch.equal(a.camera.viewmat, b.camera.viewmat)
     assert torch.equal(a.camera.K, b.camera.K)
     assert a.camera.size == b.camera.size
+
+
+@pytest.mark.parametrize(
+    ("lens", "coefficients", "shares"),
+    [
+        ("radial", [[-0.1, 0.02], [-0.11, 0.021]], True),
+        ("fisheye", [[0.1], [0.11]], True),
+        ("radial", [[-0.1, 0.02], [0.9, 1.5]], False),  # which shows less than the other one's image
+    ],
+)
+def test_lenses_have_one_limit_unless_it_is_inside_an_image(lens, coefficients, shares):
+    pinhole = along_z(40.0 if lens == "radial" else 20.0, (50, 37))
+    bent = [getattr(Distortion, lens)(k, pinhole.K, pinhole.size) for k in coefficients]
+    cameras = StackedCameras([dataclasses.replace(pinhole, distortion=one) for one in bent], CPU)
+    limits = [one.limit for one in bent]
+    assert limits[0] != limits[1]
+    assert cameras.have_one_lens == shares
+    assert [one.limit for one in cameras.lenses] == ([min(limits)] * 2 if shares else limits)
 
 
 def test_each_view_has_the_motion_of_its_camera(capture):

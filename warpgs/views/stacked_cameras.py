@@ -16,7 +16,8 @@ class StackedCameras:
     """Cameras whose lenses may differ.
 
     Attributes:
-        lenses: The lens of each camera; None for a pinhole.
+        lenses: The lens of each camera; None for a pinhole. They have one limit if no image shows anything beyond it:
+            COLMAP may find a lens for every image.
     """
 
     lenses: list[Distortion | None]
@@ -24,7 +25,7 @@ class StackedCameras:
     def __init__(self, cameras: Sequence[Camera], device: torch.device) -> None:
         self._viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device)
         self._Ks = torch.stack([camera.K for camera in cameras]).to(device)
-        self.lenses = [camera.distortion for camera in cameras]
+        self.lenses = _with_one_limit(cameras)
         none, still = torch.zeros(0, dtype=torch.float32), torch.zeros(2, 3, dtype=torch.float32)
         coefficients = [none if lens is None else lens.coefficients for lens in self.lenses]
         self._coefficients = pad_sequence(coefficients, batch_first=True).to(device)
@@ -50,3 +51,25 @@ class StackedCameras:
         distortion = None if lens is None else replace(lens, coefficients=k[: len(lens.coefficients)])
         motion = None if self._motions is None else self._motions.index_select(0, index)[0]
         return Camera(viewmat, K, *size, distortion=distortion, motion=motion)
+
+
+def _with_one_limit(cameras: Sequence[Camera]) -> list[Distortion | None]:
+    """The lenses of cameras, if of one kind with the smallest limit unless that is inside one of the images."""
+    lenses = [camera.distortion for camera in cameras]
+    known = [lens for lens in lenses if lens is not None]
+    limits = {lens.limit for lens in known}
+    is_mixed = len({lens.lens for lens in known}) > 1
+    if len(limits) < 2 or is_mixed or any(_reach(camera) > min(limits) for camera in cameras):
+        return lenses
+    return [None if lens is None else replace(lens, limit=min(limits)) for lens in lenses]
+
+
+def _reach(camera: Camera) -> float:
+    """How far from the axis the corners of an image are, as a ``Distortion.limit``; 0 for a pinhole."""
+    if camera.distortion is None:
+        return 0.0
+    x, y = (torch.tensor([0.0, side], dtype=torch.float32) for side in camera.size)
+    rays = camera.to("cpu").rays(torch.cartesian_prod(x, y))
+    slopes = rays[:, :2].norm(dim=1)
+    reach = slopes / rays[:, 2] if camera.distortion.lens == "radial" else torch.atan2(slopes, rays[:, 2])
+    return float(reach.nan_to_num(0.0).max())
