@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from .colmap_files import read_model
-from .lens import Lens, LensModel, unsupported_model
+from .lens import DistortionModel, Lens, unsupported_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -90,7 +90,7 @@ def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float
     if len(params) != NUM_PARAMETERS[model]:
         raise ValueError(f"{model} has {NUM_PARAMETERS[model]} parameters, got {len(params)}")
     fx, fy, cx, cy, *coefficients = (params[0], *params) if model in SIMPLE else params
-    kind: LensModel = "fisheye" if model.endswith("FISHEYE") else "radial"
+    kind: DistortionModel = "fisheye" if model.endswith("FISHEYE") else "radial"
     return Lens(*size, (fx, fy), (cx, cy), tuple(coefficients), kind).checked()
 
 

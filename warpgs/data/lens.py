@@ -18,7 +18,7 @@ from warpgs.files import MAX_NUMBER
 
 from .images import MAX_PIXELS, MAX_SIDE
 
-LensModel = Literal["radial", "fisheye"]
+DistortionModel = Literal["radial", "fisheye"]
 
 MIN_FOCAL = 1e-3
 """Minimum focal length [px]; the reciprocals of smaller ones overflow."""
@@ -58,7 +58,7 @@ class Lens:
     focal: tuple[float, float]
     center: tuple[float, float]
     coefficients: tuple[float, ...] = ()
-    model: LensModel = "radial"
+    model: DistortionModel = "radial"
 
     def __post_init__(self) -> None:
         count = max((k + 1 for k, value in enumerate(self.coefficients) if value), default=0)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from warpgs.data.colmap import lens_of_parameters
-from warpgs.data.lens import Lens, LensModel
+from warpgs.data.lens import DistortionModel, Lens
 from warpgs.files import read_bounded, read_json, read_numbers
 from warpgs.parsed import reason
 
@@ -171,7 +171,7 @@ def _of_opencv(path: Path, fields: dict[str, Any], size: tuple[int, int] | None)
         size = round(_number(path, fields, "image_width")), round(_number(path, fields, "image_height"))
     width, height = size or (round(2.0 * cx) + 1, round(2.0 * cy) + 1)  # only to check the file: no frames yet
     coefficients = tuple(distortion.tolist())
-    model: LensModel = "fisheye" if is_fisheye else "radial"
+    model: DistortionModel = "fisheye" if is_fisheye else "radial"
     try:
         return Lens(width, height, (fx, fy), (cx + 0.5, cy + 0.5), coefficients, model).checked()
     except ValueError as error:
