@@ -106,7 +106,7 @@ PAPER = {
 
 RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
 RUN |= {"lpips_net"}
-RUN |= {"damage_masks", "checkpoint_every", "resident_bytes"}
+RUN |= {"readout", "damage_masks", "checkpoint_every", "resident_bytes"}
 """Options of a run that do not belong to the method."""
 
 METHOD = Path(__file__).parents[1] / "docs" / "method.md"

@@ -125,7 +125,9 @@ def _write_index(folder: Path, capture: Capture, names: list[str], val: list[str
     steps = dict(zip(names, time_steps(times), strict=True))
     trained = {steps[name] for name in names if name not in val}
     other_camera = {name: int(name in val and steps[name] in trained) for name in names}
-    writer.write_index(folder, steps, val, other_camera, estimated_masks=capture.estimated_masks)
+    writer.write_index(
+        folder, steps, val, other_camera, estimated_masks=capture.estimated_masks, readout=capture.readout
+    )
 
 
 def _depths(capture: Capture) -> np.ndarray:

@@ -27,6 +27,7 @@ def load_capture(
     perturbation: MaskPerturbation | None = None,
     cache_frames: int = LoadOptions.cache_frames,
     distortion: bool = LoadOptions.distortion,
+    readout: float | None = None,
 ) -> Capture:
     """Opens a capture: reads cameras and points and checks that every file exists; images are read on use.
 
@@ -39,13 +40,14 @@ def load_capture(
         distortion: Whether cameras have the distortion and the principal point of their lens; if not, they are pinholes
             with the principal point at the centre of the image. HyperNeRF's captures of two cameras (vrig) have a
             default factor of 4 then, as in Deformable-3DGS.
+        readout: See ``Capture.readout``; that of the capture's files, which is 0 without any, if None.
 
     Raises:
         ValueError: If anything is missing, damaged or inconsistent; one line that names the file.
     """
     if not isinstance(root, str | os.PathLike):
         raise ValueError(f"a capture is opened by the path of its folder, got {reprlib.repr(root)}")
-    options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, distortion)
+    options = LoadOptions(factor, perturbation or MaskPerturbation(), cache_frames, distortion, readout=readout)
     capture = load_with(capture_folder(root, factor=factor), dataset, options)
     capture.is_builtin = is_builtin(root)
     return capture
@@ -64,7 +66,9 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         require_factor("builtin:room", config.factor)
         root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     damage = MaskPerturbation.parse(config.damage_masks)
-    options = LoadOptions(config.factor, damage, distortion=config.distortion, depth=config.depth)
+    options = LoadOptions(
+        config.factor, damage, distortion=config.distortion, depth=config.depth, readout=config.readout
+    )
     capture = load_with(root, config.dataset, options)
     capture.is_builtin = config.data is None or is_builtin(config.data)
     if config.background == "capture" or config.background == "mean":

@@ -39,6 +39,9 @@ class TrainConfig:
     """Project by the principal point and the distortion of each camera's lens. Without it cameras are as in
     Deformable-3DGS (paper): pinholes whose principal point is the centre, and HyperNeRF's captures of two cameras
     (vrig) have a factor of 4."""
+    readout: Annotated[float | None, Bounds(min=-1, max=1)] = None
+    """Rolling shutter: time in which the rows of a frame are read from top to bottom, as a part of the time between two
+    frames; negative from bottom to top. That of the capture's files if omitted, 0 (global shutter) without any."""
     out: Path | None = None
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None

@@ -128,6 +128,8 @@ class Capture:
         estimated_masks: Whether the masks are estimates of ``warpgs prepare`` instead of given.
         background: Colour behind everything; black is also that of captures whose images show no background.
         time_source: Where the times of the cameras come from.
+        readout: Time in which the rows of a frame are read from the first to the last, as a part of the median time
+            between training frames; negative from the last to the first, 0 with a global shutter. See ``with_readout``.
         layout: Name of the layout of its files, for the middle of messages; empty if it was not read from files.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         conventions: What its files mean.
@@ -155,6 +157,7 @@ class Capture:
     is_builtin: bool = False
     notes: Sequence[str] = ()
     time_source: TimeSource = AS_GIVEN
+    readout: float = 0.0
     layout: str = ""
     conventions: Conventions = field(default_factory=Conventions)
     assumption: Assumption = field(init=False)

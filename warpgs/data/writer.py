@@ -184,6 +184,7 @@ def write_index(
     camera_ids: Mapping[str, int] | None = None,
     *,
     estimated_masks: bool = False,
+    readout: float = 0.0,
 ) -> None:
     """Writes metadata.json, then dataset.json, which makes the folder a capture.
 
@@ -195,6 +196,7 @@ def write_index(
         val: Frames to evaluate on; all others are trained on.
         camera_ids: Camera of every frame; all are camera 0 if None.
         estimated_masks: Whether the masks are estimates, see ``Capture.estimated_masks``.
+        readout: See ``Capture.readout``.
     """
     index = {step: k for k, step in enumerate(sorted(set(time_ids.values())))}
     metadata = {}
@@ -205,8 +207,8 @@ def write_index(
     train_ids, val_ids = ([name for name in time_ids if (name in val) == held_out] for held_out in (False, True))
     counts = {"count": len(time_ids), "num_exemplars": len(train_ids)}
     splits = {"ids": [*time_ids], "train_ids": train_ids, "val_ids": val_ids}
-    masks = {"masks": ESTIMATED} if estimated_masks else {}
-    write_json(root / "dataset.json", {**counts, "layout": LAYOUT, **masks, **splits})
+    others = ({"masks": ESTIMATED} if estimated_masks else {}) | ({"readout": readout} if readout else {})
+    write_json(root / "dataset.json", {**counts, "layout": LAYOUT, **others, **splits})
 
 
 def _reduced_size(image: np.ndarray, factor: int) -> tuple[int, int]:

@@ -115,6 +115,7 @@ FORMER: dict[str, dict[str, Any]] = {
         "max_alpha": 0.999,
         "out": None,
         "preset": None,
+        "readout": None,
         "resume": None,
     },
     "densify": {

@@ -12,6 +12,7 @@ from warpgs.data.capture import Capture
 from warpgs.data.colmap_folders import find_models
 from warpgs.data.masks import check_perturbation
 from warpgs.data.missing import missing_folder
+from warpgs.data.readout import with_readout
 from warpgs.data.writer import FINISHED, STATE, WORK
 from warpgs.errors import command, missing, not_one_of
 from warpgs.files import read_json
@@ -89,7 +90,10 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     capture = LOADERS[layout].load(root, options)
     _require_sides(root, capture)
     capture.layout = describe_layout(root, layout, dataset)
-    return capture
+    try:
+        return with_readout(capture, capture.readout if options.readout is None else options.readout)
+    except ValueError as error:
+        raise ValueError(f"{root}: {error}") from error
 
 
 def _require_sides(root: Path, capture: Capture) -> None:

@@ -29,7 +29,7 @@ from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.data.writer import ESTIMATED, GIVEN, is_plain_id
 from warpgs.errors import command
-from warpgs.files import read_json
+from warpgs.files import read_json, read_numbers
 
 from .listed import ListedFiles, find_file
 from .options import LoadOptions
@@ -111,6 +111,7 @@ class NerfiesLoader(ABC):
             metric_depth=self.has_metric_depth(path for path in depths if path is not None),
             estimated_masks=_are_estimates(root / "dataset.json", dataset) and any(f.mask for f in files.values()),
             time_source=time_source,
+            readout=float(read_numbers(root / "dataset.json", {"readout": 0.0, **dataset}, "readout", ())),
             notes=[
                 *turning_notes([files[name].image for name in cameras], [camera.size for camera in cameras.values()]),
                 *skipped_images(root, (file.image for file in files.values()), listed),

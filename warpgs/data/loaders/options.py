@@ -10,7 +10,7 @@ class LoadOptions:
     """How a capture is read; ``load_with`` has checked them.
 
     Attributes:
-        factor, perturbation, cache_frames, distortion: Arguments of ``load_capture``.
+        factor, perturbation, cache_frames, distortion, readout: Arguments of ``load_capture``.
         depth: Whether to read depth. Without it the capture is the same as one whose files have none: it has no points
             that are unprojected from depth either.
     """
@@ -20,3 +20,4 @@ class LoadOptions:
     cache_frames: int = 256
     distortion: bool = True
     depth: bool = True
+    readout: float | None = None

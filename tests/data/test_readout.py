@@ -1,0 +1,136 @@
+"""Captures filmed with a rolling shutter: the motion of their cameras."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from tests.data.captures import edit_json, refused, write_capture
+from tests.test_shutter import at_readout
+from warpgs.cameras import Camera
+from warpgs.captures.import_capture import import_capture
+from warpgs.captures.opening import load_capture, open_capture
+from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.readout import with_readout
+
+SIZE = (40, 24)
+K = np.array([[30.0, 0.0, 20.0], [0.0, 30.0, 12.0], [0.0, 0.0, 1.0]])
+TRAIN, VAL = {"a": 0.0, "b": 0.25, "d": 0.75, "e": 1.0}, {"c": 0.5}
+
+
+def on_path(time: float, turn: float = 0.2, shift: float = 0.0) -> Camera:
+    """A camera that turns by an angle [radians] and moves from time 0 to 1, at a constant speed."""
+    axis, move = np.array([0.48, 0.8, -0.36]), np.array([0.4, -0.3, 0.8])
+    rotation = Rotation.from_rotvec([0.1, -0.4, 0.2]) * Rotation.from_rotvec(-time * turn * axis)
+    return Camera.posed(rotation.as_matrix(), np.array([0.2 + shift, 0.1, -3.0]) + time * move, K, SIZE, time)
+
+
+def filmed(train: dict[str, float], val: dict[str, float], **path: float) -> Capture:
+    """Frames at times; the keyword arguments are of the path."""
+    cameras = {name: on_path(time, **path) for name, time in {**train, **val}.items()}
+    frames = {name: Frame(name, c, torch.zeros(*SIZE[::-1], 3, dtype=torch.uint8)) for name, c in cameras.items()}
+    return Capture("walk", cameras, [*train], [*val], torch.zeros(0, 3), None, frames.__getitem__)
+
+
+def assert_rows_see(capture: Capture, interval: float, **path: float) -> None:
+    """Compares the pose of first and last rows with the path."""
+    for camera in capture.cameras.values():
+        for s in (-0.5, 0.5):
+            expected = on_path(camera.time + s * capture.readout * interval, **path)
+            torch.testing.assert_close(at_readout(camera, s).viewmat, expected.viewmat, rtol=0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("readout", [1.0, 0.4, -0.4])
+def test_the_first_and_the_last_row_are_where_the_camera_is_on_its_path(readout):
+    assert_rows_see(with_readout(filmed(TRAIN, VAL), readout), interval=0.25)
+
+
+def test_the_speed_at_the_ends_of_a_curved_path_is_that_of_the_path():
+    names = [f"{k:02d}" for k in range(21)]
+    capture = filmed({name: k / 20 for k, name in enumerate(names)}, {})
+    swaying = {}
+    for k, name in enumerate(names):
+        viewmat = capture.cameras[name].viewmat.clone()
+        viewmat[:3, :3], viewmat[:3, 3] = torch.eye(3), torch.tensor([-math.sin(0.25 * k), 0.0, 0.0])
+        swaying[name] = dataclasses.replace(capture.cameras[name], viewmat=viewmat)
+    moving = with_readout(capture.with_cameras(swaying), 0.5)
+    for k, name in enumerate(names):
+        speed = 0.5 * 0.25 * math.cos(0.25 * k)
+        assert moving.cameras[name].motion[1, 0].item() == pytest.approx(speed, abs=0.02 * 0.5 * 0.25)
+
+
+def test_frames_of_one_time_are_of_two_cameras():
+    stereo = filmed({"a": 0.0, "b": 0.25, "c": 0.5}, {})
+    beside = {f"right {time}": on_path(time, shift=0.5) for time in (0.0, 0.5)}
+    both = dataclasses.replace(stereo, cameras={**stereo.cameras, **beside}, val=[*beside])
+    moving = with_readout(both, 0.5)
+    for name in both.train:
+        assert torch.equal(moving.cameras[name].motion, with_readout(stereo, 0.5).cameras[name].motion)
+    for name in beside:
+        left = next(c for n, c in moving.cameras.items() if n in both.train and c.time == both.cameras[name].time)
+        torch.testing.assert_close(moving.cameras[name].motion, left.motion, rtol=1e-3, atol=2e-4)
+
+
+def test_frames_are_read_with_their_motion():
+    capture = with_readout(filmed(TRAIN, VAL), 0.5)
+    assert capture.readout == 0.5
+    assert capture.frame("a").camera.motion is capture.cameras["a"].motion
+
+
+def test_cameras_with_a_global_shutter_have_no_motion():
+    assert all(camera.motion is None for camera in with_readout(filmed(TRAIN, VAL), 0.0).cameras.values())
+
+
+@pytest.mark.parametrize("readout", [1.01, -2.0, math.nan, math.inf])
+def test_a_readout_longer_than_a_frame_is_refused(readout):
+    with pytest.raises(ValueError, match=f"readout must be a number from -1 to 1, .*, got {readout}"):
+        with_readout(filmed(TRAIN, VAL), readout)
+
+
+@pytest.mark.parametrize(
+    ("train", "val", "message"),
+    [
+        ({"a": 0.0, "b": 0.0}, {}, "one camera one after another: a and b have one time"),
+        ({"a": 0.0, "b": 0.5}, {"c": 0.0}, "one camera one after another: c is the only one"),
+        ({"a": 0.0}, {}, "one camera one after another: a is the only one"),
+    ],
+)
+def test_cameras_without_a_known_motion_are_refused(train, val, message):
+    with pytest.raises(ValueError, match=message):
+        with_readout(filmed(train, val), 1.0)
+
+
+def test_the_readout_of_a_capture_is_in_its_files(tmp_path):
+    root = write_capture(tmp_path / "capture", "nerfds")
+    assert load_capture(root).readout == 0.0
+    edit_json(root / "dataset.json", readout=0.6)
+    capture = load_capture(root)
+    assert capture.readout == 0.6
+    assert all(camera.motion is not None for camera in capture.cameras.values())
+    assert load_capture(root, readout=0.0).cameras[capture.train[0]].motion is None
+    assert open_capture(TrainConfig(data=root, readout=0.3)).readout == 0.3
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("fast", "dataset.json: readout must hold numbers, got 'fast'"),
+        ([0.5], r"dataset.json: readout must be finite numbers of shape \[\]"),
+        (1.5, "capture: readout must be a number from -1 to 1"),
+    ],
+)
+def test_a_file_with_a_wrong_readout_is_refused(value, message, tmp_path):
+    root = write_capture(tmp_path / "capture", "nerfds")
+    edit_json(root / "dataset.json", readout=value)
+    refused(root, message)
+
+
+def test_an_imported_capture_keeps_its_readout(tmp_path):
+    root = write_capture(tmp_path / "capture", "nerfds")
+    edit_json(root / "dataset.json", readout=0.6)
+    import_capture(root, tmp_path / "copy")
+    assert load_capture(tmp_path / "copy").readout == 0.6
