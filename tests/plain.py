@@ -23,7 +23,7 @@ model = partial(
         tracks=True,
     ),
 )
-loss = partial(replace, replace(PAPER.loss, depth=2.0, depth_dynamic=1.0, depth_end=0.2, depth_gate=True))
+loss = partial(replace, replace(PAPER.loss, depth=2.0, depth_dynamic=1.0, depth_end=0.2))
 optim = partial(replace, replace(PAPER.optim, means=1.6e-4, means_anneal="run"))
 densify = partial(replace, replace(PAPER.densify, unit="pixel"))
 schedule = partial(

@@ -36,7 +36,6 @@ PAPER = {
     "Depth-Aware Pretraining: Eq. 14": {
         "depth": True,
         "loss.depth_dynamic": 0.0,
-        "loss.depth_gate": False,
         "loss.depth_tolerance": 0.0,
         "loss.object_depth": False,
     },

@@ -29,8 +29,8 @@ def test_earlier_runs_without_pretraining_stay_without_a_depth_loss(run, dap, is
     def change(values):
         del values["omit"]
         values |= {"dap": dap, "vdp": True, "app": True, "stage2": True}
-        if is_old:
-            del values["loss"]["depth_gate"]
+        if not is_old:
+            values["loss"]["depth_gate"] = False
 
     depth = read_config(run).loss.depth
     assert depth > 0

@@ -187,8 +187,8 @@ def view_depth():
     return 1.0 / (0.5 * INVERSE_DEPTH.double() + 0.1)
 
 
-def expected_depth(layer, region, min_alpha=0.5):
-    known = region & (layer.alpha > min_alpha)
+def expected_depth(layer, region):
+    known = region & (layer.alpha > 0.5)
     assert known.any()
     return ((layer.depth.double() - view_depth()) * known).abs().mean() / VIEW_SIZE
 
@@ -228,18 +228,6 @@ def test_the_schedule_compares_the_joint_image_in_stage_1_already():
     assert error(terms["joint"], compared(rendering.joint.image, view_truth(), 0.3)) < 1e-6
     assert "joint" not in terms_of("stage1")[0]
     assert "joint" not in terms_of("pretrain", schedule=schedule)[0]
-
-
-def test_without_its_gate_the_depth_term_is_equation_14_in_transparent_pixels_too():
-    ungated = dataclasses.replace(LOSS, depth_gate=False)
-    terms, rendering = terms_of("pretrain", ungated)
-    transparent = VIEW_MASK & (rendering.static.alpha < 0.5)
-    assert transparent.float().mean() > 0.1
-    assert (transparent & (rendering.static.alpha == 0)).any()
-    assert error(terms["depth"], 2.0 * expected_depth(rendering.static, VIEW_MASK, min_alpha=-1.0)) < 1e-5
-    scene, plan, step = prepared("pretrain", ungated)
-    step(plan, Sample(0, 0.0, 0))
-    assert all(parameter.isfinite().all() for parameter in scene.parameters())
 
 
 def terms_with_trust(weight, margin, loss=LOSS, **options):

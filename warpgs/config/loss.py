@@ -28,8 +28,6 @@ class LossConfig:
     """Weight of the dynamic image's depth in the dynamic region, relative to λ_depth; 0 in the paper."""
     depth_end: float = 0.2
     """Final λ_depth; it decays exponentially."""
-    depth_gate: bool = True
-    """Whether depth is compared only where the rendered opacity exceeds a half; paper Eq. 14 compares it everywhere."""
     branches_in_stage2: Literal["yes", "no", "given-masks"] = "given-masks"
     """Whether stage II keeps the terms of the single branches (Eq. 9, 12, 14) beside the joint image, as Eq. 15 does,
     or compares that image alone, as the authors' code does; given-masks: keeps them unless `prepare` made the masks."""

@@ -40,7 +40,6 @@ PAPER = replace(
         depth=1.0,
         depth_dynamic=0.0,
         depth_end=0.01,
-        depth_gate=False,
         branches_in_stage2="yes",
         depth_tolerance=0.0,
         object_depth=False,

@@ -60,6 +60,7 @@ REMOVED: dict[str, Removed] = {
     "densify.min_opacity": _always(0.005),
     "densify.noise": Removed("there is no strategy mcmc any more"),
     "densify.split_size": _sizes(2.0, 0.01),
+    "loss.depth_gate": Removed("depth is compared where the opacity exceeds a half"),
     "loss.depth_margin": Removed(
         "it is 3 with loss.depth_tolerance, else 0",
         lambda value, loss: value == (3.0 if loss.get("depth_tolerance") else 0.0),
@@ -129,7 +130,6 @@ FORMER: dict[str, dict[str, Any]] = {
     "loss": {
         "acceleration": 0.0,
         "branches_in_stage2": "yes",
-        "depth_gate": True,
         "depth_tolerance": 0.0,
         "hidden_appearance": True,
         "mask_margin": 0.0,

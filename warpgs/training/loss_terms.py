@@ -44,14 +44,15 @@ def squared(inputs: LossInputs) -> Float[Tensor, ""]:
 def _depth_error(
     inputs: LossInputs, layer: Layer | None, region: Bool[Tensor, "H W"], margin: Float[Tensor, ""]
 ) -> Float[Tensor, ""]:
-    """The error of a layer's depth in a region of the mask, in ``LossInputs.unit``, times the view's trust."""
+    """The error of a layer's depth where its opacity exceeds a half, in a region of the mask, times the view's trust.
+
+    In ``LossInputs.unit``. The rendered depth is divided by alpha: nearly empty pixels have gradients of 1 / alpha.
+    """
     assert layer is not None
     assert layer.depth is not None
     assert inputs.alignment is not None
     assert inputs.depth_trust is not None
-    # The op skips pixels with an opacity of at most a half.
-    alpha = layer.alpha if inputs.config.depth_gate else torch.ones_like(layer.alpha)
-    error = depth_error(layer.depth, alpha, inputs.view.inverse_depth, inputs.alignment, region, margin)
+    error = depth_error(layer.depth, layer.alpha, inputs.view.inverse_depth, inputs.alignment, region, margin)
     return error * inputs.depth_trust.weight * inputs.view.mask_trust / inputs.unit
 
 
