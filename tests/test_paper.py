@@ -88,6 +88,7 @@ PAPER = {
         "schedule.settle": 0,
         "loss.squared": 0.0,
         "loss.acceleration": 0.0,
+        "model.reflections": False,
         "loss.hidden_appearance": True,
         "densify.reseed": 0.0,
         "schedule.fit_motion": 0,

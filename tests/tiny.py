@@ -92,10 +92,10 @@ def plan_to(trainer: Trainer, action: Action) -> IterationPlan:
     return dataclasses.replace(trainer.protocol.at(0), actions=(action,))
 
 
-def finished(folder: Path) -> Path:
+def finished(folder: Path, config: TrainConfig = CONFIG) -> Path:
     """Trains a run through all stages; its capture is in the same folder."""
     data = write(folder / "capture")
-    config = dataclasses.replace(CONFIG, data=data, out=folder / "run")
+    config = dataclasses.replace(config, data=data, out=folder / "run")
     Run.create(folder / "run", plain.plan(config))
     with in_haste():
         train(trainer(data, folder / "run", config))

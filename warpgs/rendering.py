@@ -151,6 +151,7 @@ def render(
     if background is None and splats.num_channels == 3:
         background = splats.background
     _check_inputs(splats, camera, background, settings, screen_offsets)
+    splats = splats.seen_from(camera.viewmat)
     if camera.distortion is not None and camera.distortion.lens == "equirectangular":
         splats, screen_offsets = _twice(splats, camera, screen_offsets)
         return _once(_rendered(splats, camera, screen_offsets, background, settings))

@@ -223,6 +223,7 @@ def test_the_rate_of_positions_decays_by_branch():
 def test_gaussians_settle_at_a_tenth_of_their_rates():
     before, halfway, end = (rates_at(0.9, START, settle=settle) for settle in (0.0, 0.5, 1.0))
     settling = {f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS if name != "means"}
+    settling.add("dynamic.reflectances")
     assert before == rates_at(0.9, START)
     for rates, factor in ((halfway, math.sqrt(0.1)), (end, 0.1)):
         expected = {name: rate * (factor if name in settling else 1.0) for name, rate in before.items()}
@@ -232,7 +233,7 @@ def test_gaussians_settle_at_a_tenth_of_their_rates():
 def test_the_other_rates_of_gaussians_depend_neither_on_progress_nor_on_the_unit():
     now, later = rates_at(0.0, START), rates_at(0.9, END, unit=5.0)
     changed = {name for name in GROUPS if now[name] != later[name]}
-    assert changed == {"static.means", "dynamic.means", *NETWORKS}
+    assert changed == {"static.means", "dynamic.means", *NETWORKS, "light"}
 
 
 def test_each_network_has_its_own_progress():

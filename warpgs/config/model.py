@@ -55,5 +55,8 @@ class ModelConfig:
     dropout: Annotated[float, Bounds(max=0.9)] = 0.1
     """Fraction of the Gaussians that each iteration of stages I and II omits at random, while the opacities of the
     others are divided by one minus it, so that none relies on a few others (DropGaussian). 0: none (paper)."""
+    reflections: bool = False
+    """Whether a network adds colours to dynamic Gaussians by their normals and by the directions that they reflect, in
+    world axes: highlights stay where the light is while objects turn. Exports omit them."""
     tracks: bool = True
     """Whether small objects that move far between frames start on tracks (docs/design/tracks.md)."""

@@ -22,6 +22,6 @@ class OptimConfig:
     """Initial rate of the corrections of camera poses [rad, and fractions of the view size]; decays exponentially to
     1 %. 0: cameras stay as the capture has them (paper)."""
     networks: Annotated[float, Bounds(positive=True)] = 8e-4
-    """Initial rate of both networks (paper, training protocol)."""
+    """Initial rate of the networks (paper, training protocol)."""
     networks_end: Annotated[float, Bounds(positive=True)] = 1.6e-6
-    """Final rate of both networks; it decays exponentially while they are trained."""
+    """Final rate of the networks; it decays exponentially while they are trained."""

@@ -45,7 +45,7 @@ class Cloud:
     def of_splats(splats: Splats, antialias: bool = False) -> "Cloud":
         """The cloud of splats that are coloured by spherical harmonics, up to the degree in use.
 
-        Gaussians with values that are not finite are kept; ``finite`` marks the others.
+        Gaussians with values that are not finite are kept; ``finite`` marks the others. Reflections are omitted.
         """
         assert splats.sh is not None
         bases = splats.sh.shape[1] if splats.sh_degree is None else num_bases(splats.sh_degree)

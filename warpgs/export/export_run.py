@@ -18,6 +18,9 @@ from .writers import WRITERS
 COUNTS = {"frames": MAX_FRAMES, "keys": MAX_KEYS}
 """Options that are counts, and their maxima."""
 
+REFLECTIONS_NOTE = "no format holds reflections: dynamic Gaussians have the colours of their spherical harmonics alone"
+"""A line about scenes of ``model.reflections``."""
+
 POSITIVE = ("seconds", "max_megabytes", "precision")
 """Options that are positive numbers."""
 
@@ -39,7 +42,10 @@ def export_run(options: Export) -> str:
         job.clouds = job.clouds.most_visible(options.max_gaussians, cameras, options.quiet)
     writer = WRITERS[options.format]
     summary = writer.write(job)
-    return summary if writer.has_background else f"{summary}\n{_background_note(run)}"
+    notes = [] if writer.has_background else [_background_note(run)]
+    if job.clouds.scene.scene.light is not None:
+        notes.append(REFLECTIONS_NOTE)
+    return "\n".join([summary, *notes])
 
 
 def _background_note(run: Run) -> str:

@@ -24,7 +24,10 @@ class Gaussians(nn.Module):
         logit_opacities: [N] logits of the opacities.
         sh_dc: [N, 1, 3] SH coefficients of degree 0.
         sh_rest: [N, 0 | 3 | 8 | 15, 3] SH coefficients of degrees 1 to 0 | 1 | 2 | 3.
+        reflectances: [N, F] how they reflect light (``reflections``); None unless they do.
     """
+
+    reflectances: nn.Parameter | None
 
     def __init__(
         self,
@@ -42,6 +45,7 @@ class Gaussians(nn.Module):
         self.logit_opacities = nn.Parameter(logit_opacities)
         self.sh_dc = nn.Parameter(sh_dc)
         self.sh_rest = nn.Parameter(sh_rest)
+        self.register_parameter("reflectances", None)
 
     @staticmethod
     def from_points(
@@ -103,10 +107,12 @@ class Gaussians(nn.Module):
 
     @torch.no_grad()
     def append(self, added: "Gaussians") -> None:
-        """Appends Gaussians of the same degree of spherical harmonics, from any device.
+        """Appends Gaussians of the same degree of spherical harmonics, from any device; reflectances they lack are 0.
 
         Gradients are dropped. ``training.optimizer.append`` also updates the optimizer's state.
         """
         for name, parameter in self.named_parameters():
-            parameter.data = torch.cat([parameter.data, getattr(added, name).to(parameter.device)])
+            new = getattr(added, name)
+            new = parameter.new_zeros(len(added), *parameter.shape[1:]) if new is None else new.to(parameter.device)
+            parameter.data = torch.cat([parameter.data, new])
             parameter.grad = None

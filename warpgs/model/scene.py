@@ -12,6 +12,7 @@ from warpgs.runtime.streams import concurrently
 
 from .fields import make_deformation
 from .gaussians import Gaussians
+from .reflections import Light, reflections
 from .splats import Splats
 from .trunk import Trunk
 
@@ -56,6 +57,7 @@ class SplitScene(nn.Module):
         dynamic: Gaussians in canonical space, of constant appearance.
         deformation: F_θ of Eq. 10.
         appearance: MLP_app of Eq. 8.
+        light: What the dynamic Gaussians reflect; None if they reflect nothing.
 
     Raises:
         ValueError: If there is no deformation model of the configured name.
@@ -71,9 +73,16 @@ class SplitScene(nn.Module):
     ) -> None:
         super().__init__()
         self.static = static
-        self.dynamic = dynamic
         self.deformation = make_deformation(config, center, half_size)
         self.appearance = AppearanceField(config, center, half_size)
+        self.sh_degree, self.light = config.sh_degree, Light(center) if config.reflections else None
+        self.set_dynamic(dynamic)
+
+    def set_dynamic(self, dynamic: Gaussians) -> None:
+        """Replaces the dynamic Gaussians by others, which reflect as the scene does."""
+        if self.light is not None and dynamic.reflectances is None:
+            dynamic.reflectances = nn.Parameter(dynamic.means.new_zeros(len(dynamic), self.light.size))
+        self.dynamic = dynamic
 
     @staticmethod
     def empty(num_static: int, num_dynamic: int, config: ModelConfig) -> "SplitScene":
@@ -98,7 +107,7 @@ class SplitScene(nn.Module):
             time: Time in [0, 1].
             use_deformation: Whether the deformation network deforms the dynamic Gaussians (paper Eq. 11).
             use_appearance: Whether the appearance network changes the static ones (paper Eq. 8).
-            sh_degree: Maximum degree of spherical harmonics to use; all if None.
+            sh_degree: Maximum degree of spherical harmonics to use; all if None. Reflections need all.
             time_noise: Added to the time that the deformation network sees (annealed smoothing of Deformable-3DGS).
             is_hidden: Static Gaussians from which the appearance network gets no gradient; none if None.
         """
@@ -115,7 +124,12 @@ class SplitScene(nn.Module):
         static_changes, dynamic_changes = Changes(logit_residuals=logit_residuals), Changes(offsets)
         geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
-        return Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree)
+        splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree)
+        if self.light is None or dynamic.reflectances is None or sh_degree not in (None, self.sh_degree):
+            return splats
+        quats = splats.quats[len(static) :]
+        reflected = reflections(self.light, dynamic.log_scales, quats, dynamic.reflectances)
+        return dataclasses.replace(splats, reflections=reflected)
 
     def static_splats(self, sh_degree: int | None = None) -> Splats:
         """The static Gaussians alone, with their own appearance w⁰."""

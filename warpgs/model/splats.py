@@ -10,6 +10,9 @@ from torch import Tensor
 from warpgs.ops.sh import check_coefficients
 from warpgs.runtime.checks import check_same_device, check_tensor
 
+from .gaussians import SH_C0
+from .reflections import Reflections
+
 
 @dataclass(frozen=True)
 class Splats:
@@ -26,6 +29,7 @@ class Splats:
         sh_degree: Highest degree of ``sh`` to use; that of ``sh`` by default.
         background: [3] colour behind them, black if None; not used if ``colors`` have another number of channels, which
             are composited over 0.
+        reflections: What the last Gaussians reflect, which is added to their colours by ``sh``; None if nothing.
 
     Raises:
         ValueError: On a wrong shape, dtype or device, or unless exactly one of ``colors`` and ``sh`` is given.
@@ -40,6 +44,7 @@ class Splats:
     is_dynamic: Bool[Tensor, " N"] | None = None
     sh_degree: int | None = None
     background: Float[Tensor, "3"] | None = None
+    reflections: Reflections | None = None
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}
@@ -72,8 +77,18 @@ class Splats:
         """Number of channels of an image of these splats."""
         return 3 if self.colors is None else self.colors.shape[1]
 
+    def seen_from(self, viewmat: Float[Tensor, "4 4"]) -> "Splats":
+        """The same splats, with what they reflect towards a camera as part of ``sh``."""
+        if self.reflections is None or self.sh is None or not len(self.reflections.normals):
+            return self
+        first, bases = len(self.means) - len(self.reflections.normals), self.sh.shape[1]
+        colors = self.reflections.colors(self.means[first:], viewmat) / SH_C0
+        added = torch.nn.functional.pad(colors[:, None], (0, 0, 0, bases - 1, first, 0))
+        return dataclasses.replace(self, sh=self.sh + added, reflections=None)
+
     def to(self, device: torch.device | str) -> "Splats":
         """A copy on another device."""
         names = (*self.tensor_names(), "background")
         tensors = {n: t.to(device) for n in names if (t := getattr(self, n)) is not None}
-        return dataclasses.replace(self, **tensors)
+        reflections = None if self.reflections is None else self.reflections.to(device)
+        return dataclasses.replace(self, **tensors, reflections=reflections)

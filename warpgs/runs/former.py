@@ -141,6 +141,7 @@ FORMER: dict[str, dict[str, Any]] = {
         "dropout": 0.0,
         "min_period": 0.0,
         "raw_input": True,
+        "reflections": False,
         "tracks": True,
     },
     "optim": {"means_anneal": "run", "poses": 0.0},

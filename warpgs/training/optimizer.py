@@ -31,6 +31,9 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 FIXED_RATES = {"quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 0.05, "sh_rest": 1.25e-4}
 """Learning rates of parameters of Gaussians that no preset changes (3DGS, Deformable-3DGS)."""
 
+REFLECTANCES = 2.5e-3
+"""Learning rate of the dynamic Gaussians' reflectances, that of colours (3DGS)."""
+
 MEANS_DECAY = 0.01
 """Final learning rate of positions, relative to the initial one (3DGS)."""
 
@@ -42,8 +45,10 @@ POSES_DECAY = 0.01
 
 BRANCHES = ("static", "dynamic")
 NETWORKS = ("deformation", "appearance")
-GROUPS = (*(f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS), *NETWORKS, "poses")
-"""Names of the parameter groups: each Gaussian parameter of each branch, each network, and the camera poses."""
+REFLECTIONS = ("dynamic.reflectances", "light")
+GROUPS = (*(f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS), *NETWORKS, "poses", *REFLECTIONS)
+"""Names of the parameter groups: each Gaussian parameter of each branch, each network, the camera poses, and what
+dynamic Gaussians reflect."""
 
 
 def trained_parameters(scene: SplitScene, poses: PoseCorrections | None) -> dict[str, nn.Parameter]:
@@ -109,6 +114,8 @@ def learning_rates(config: OptimConfig, unit: float, at: RatePlan) -> dict[str, 
     for name in NETWORKS:
         rate = exponential(config.networks, config.networks_end, at.network_progress[name])
         rates[name] = at.warmup_factors[name] * rate
+    rates["dynamic.reflectances"] = settled * REFLECTANCES
+    rates["light"] = exponential(config.networks, config.networks_end, at.network_progress["deformation"])
     rates["poses"] = exponential(config.poses, POSES_DECAY * config.poses, at.progress)
     return {name: math.sqrt(ranks.num_ranks()) * rate for name, rate in rates.items()}
 

@@ -180,7 +180,7 @@ class Trainer:
             return False
         if logger is not None and found.lacks_fit:
             logger.log("warning: no deformation follows what moves: dynamic Gaussians start where frames show them")
-        self.scene.dynamic = found.gaussians
+        self.scene.set_dynamic(found.gaussians)
         self._start_from(self.scene)
         return True
 

@@ -41,11 +41,11 @@ def gather(gaussians: Gaussians, optimizer: Adam, parents: Int64[Tensor, " M"], 
 def append(gaussians: Gaussians, optimizer: Adam, added: Gaussians) -> None:
     """Appends Gaussians, of the same degree of spherical harmonics and from any device; their moments start at 0."""
     gaussians.append(added)
-    for name, parameter in gaussians.named_parameters():
+    for parameter in gaussians.parameters():
         state = optimizer.state.get(parameter, {})
         for moment in MOMENTS:
             if moment in state:
-                state[moment] = torch.cat([state[moment], state[moment].new_zeros(getattr(added, name).shape)])
+                state[moment] = torch.cat([state[moment], state[moment].new_zeros(len(added), *parameter.shape[1:])])
 
 
 @torch.no_grad()
