@@ -418,3 +418,18 @@ def test_stage_2_trains_of_static_gaussians_only_what_the_config_lets_it(options
     changed = changed_by("stage2", **options)
     assert of("static", changed) == trained
     assert ("appearance" in changed) == ("omit" not in options)
+
+
+@pytest.mark.parametrize(("color", "fades"), [((0.0, 0.0, 0.0), False), ((0.9, 0.1, 0.4), True)])
+def test_black_gaussians_where_nothing_moves_fade_before_another_color(color, fades, monkeypatch):
+    keep_terms(monkeypatch, "dynamic")
+    scene, plan, step = prepared("stage1")
+    with torch.no_grad():
+        scene.dynamic.sh_dc.fill_(-10.0)
+        scene.dynamic.sh_rest.zero_()
+        step.views[0].static_mask.fill_(True)
+    before = scene.dynamic.logit_opacities.detach().clone()
+    step(plan, Sample(0, 0.0, 0, color))
+    changes = scene.dynamic.logit_opacities - before
+    assert bool((changes < 0.0).any()) == fades
+    assert not bool((changes > 0.0).any())

@@ -29,6 +29,7 @@ def send(inputs, **changes):
     values = {
         "time_noise": 0.5,
         "dropout_seed": 2**24 - 1,
+        "color": (0.25, 0.5, 0.75),
         "scales": {"psnr": -10.0, "static": 2.0},
         "learning_rates": {"networks": 4.0, "means": 3.0},
     }
@@ -40,6 +41,7 @@ def test_inputs_reach_the_tensors_of_their_names():
     send(inputs)
     assert inputs.time_noise.tolist() == [0.5]
     assert inputs.dropout_seed.tolist() == [2**24 - 1]
+    assert inputs.color.tolist() == [0.25, 0.5, 0.75]
     assert {name: value.item() for name, value in inputs.scale.items()} == {"static": 2.0, "psnr": -10.0}
     assert inputs.scales.tolist() == [2.0, -10.0]
     assert {name: value.item() for name, value in inputs.learning_rates.items()} == {"means": 3.0, "networks": 4.0}

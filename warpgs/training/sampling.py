@@ -13,7 +13,7 @@ from .step import Sample
 
 
 class Sampler:
-    """Chooses a view, noise on time and what to omit for every iteration of this rank.
+    """Chooses a view, noise on time, what to omit and a colour for every iteration of this rank.
 
     Every epoch visits each view once, in a new order; the ranks take its views in turn.
     """
@@ -28,8 +28,9 @@ class Sampler:
         for _ in range(ranks.rank() + 1):  # each rank has numbers of its own, after those of the ranks before it
             noise = noise_deviation / self._num_views * torch.randn(1, dtype=torch.float32, generator=generator).item()
             dropout_seed = int(torch.randint(MAX_SEED, (1,), generator=generator))
+            red, green, blue = torch.rand(3, dtype=torch.float32, generator=generator).tolist()
         view = next(self.views(iteration, rollbacks))
-        return Sample(view, noise, dropout_seed)
+        return Sample(view, noise, dropout_seed, (red, green, blue))
 
     def views(self, iteration: int, rollbacks: int) -> Iterator[int]:
         """The views of this rank from an iteration on, without end."""

@@ -43,11 +43,13 @@ class Sample(NamedTuple):
         view: Index of the training view.
         time_noise: Added to the time that the deformation network sees.
         dropout_seed: Chooses the Gaussians that are omitted, an integer below ``ops.dropout.MAX_SEED``.
+        color: Behind the dynamic image, RGB in [0, 1].
     """
 
     view: int
     time_noise: float
     dropout_seed: int
+    color: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class Means(NamedTuple):
@@ -100,10 +102,7 @@ class Step:
         self.alignments, self._depth_trust = alignments, depth_trust
         sums = (*TERMS, "psnr", STEPS)
         self._inputs = StepInputs(sums, optim.GROUPS, device)
-        background = background_color(views.background)
-        # Behind the dynamic image is black, as in the paper, but in captures over white, whose alpha is exact.
-        colors = [background, background, background if views.background == "white" else (0.0, 0.0, 0.0)]
-        self._backgrounds = torch.tensor(colors, dtype=torch.float32, device=device)
+        self._background = torch.tensor(background_color(views.background), dtype=torch.float32, device=device)
         self._sums = torch.zeros(len(sums), dtype=torch.float32, device=device)
         self._counts: Counter[str] = Counter()  # iterations with each term since the last check, and of all
         self._zero, self._one = (
@@ -134,6 +133,7 @@ class Step:
         self._inputs.send(
             time_noise=sample.time_noise,
             dropout_seed=sample.dropout_seed,
+            color=sample.color,
             scales={**weights, "psnr": DECIBELS, STEPS: 1.0},
             learning_rates=optim.learning_rates(self.config.optim, self.config.means_unit(self.unit), plan),
         )
@@ -168,7 +168,7 @@ class Step:
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
-        backgrounds, offsets = self._backgrounds, self.density.screen_offsets if phase.densifies else None
+        backgrounds, offsets = self._backgrounds(), self.density.screen_offsets if phase.densifies else None
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
@@ -184,6 +184,16 @@ class Step:
         self.density.observe(splats, view.camera, rendering.radii)
         self._add_to_sums(terms, rendering, view)
         return ()
+
+    def _backgrounds(self) -> Float[Tensor, "3 3"]:
+        """Colours behind the joint, the static and the dynamic image.
+
+        The last one is another one in every iteration, so that no opaque Gaussian is as good as a transparent one where
+        Eq. 12 wants nothing to be seen; such Gaussians would hide the static scene. Images over white have their own
+        colour behind everything, because their alpha is exact.
+        """
+        behind = self._background if self.views.background == "white" else self._inputs.color
+        return torch.stack([self._background, self._background, behind])
 
     def _active(self, phase: Phase) -> list[str]:
         """The terms of the loss that are computed in a phase."""
