@@ -23,7 +23,7 @@ class LossConfig:
     in the paper. No object is quite opaque, so that what it hides takes its colour."""
     depth: float = 0.5
     """Initial λ_depth, the weight of the static image's depth in the static region (Eq. 14) [view sizes; scene units
-    if ``densify.unit`` is extent (paper)]."""
+    if ``densify.unit`` is extent]."""
     depth_dynamic: float = 4.0
     """Weight of the dynamic image's depth in the dynamic region, relative to λ_depth; 0 in the paper."""
     depth_end: float = 0.2

@@ -11,8 +11,8 @@ class OptimConfig:
     """Learning rates of Adam: Deformable-3DGS's where the paper prints none, also those that have no option."""
 
     means: float = 5e-4
-    """Positions [view sizes; scene units if ``densify.unit`` is extent]; decays exponentially to 1 %. 8e-4, the rate
-    that the paper prints, is also that of Deformable-3DGS, 1.6e-4 times 5 (paper)."""
+    """Positions [view sizes; scene units if ``densify.unit`` is extent]; decays exponentially to 1 %.
+    Deformable-3DGS has 1.6e-4 times 5 in scene units; the rate that the paper prints is of its networks."""
     means_anneal: Literal["run", "trained"] = "run"
     """Iterations over which the rate of positions decays: the whole run, or those in which a branch's positions are
     trained: static ones until stage II (paper, section Static Component), dynamic ones from stage I."""

@@ -45,11 +45,10 @@ PAPER = replace(
         object_depth=False,
         mask_margin=0.0,
     ),
-    optim=replace(BEST.optim, means=8e-4, means_anneal="trained", poses=0.0),
+    optim=replace(BEST.optim, means_anneal="trained", poses=0.0),
     densify=replace(
         BEST.densify,
         gradient=2e-4,
-        unit="extent",
         max_elongation=0.0,
         min_pixels=0,
         reseed=0.0,

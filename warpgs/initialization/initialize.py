@@ -110,11 +110,11 @@ def dynamic_gaussians(
 ) -> DynamicStart | None:
     """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation may be fitted first.
 
-    Without depth they start in front of the points around them, or, as ``model.start`` says and without visible
-    points, at random positions in the scene's box. If everything is assumed to be dynamic, they start at the sparse
-    points. If nothing is dynamic, there are none. What was tracked starts on its tracks. The deformation is fitted
-    unless ``schedule.fit_motion`` is 0, as in plans where it cannot be. The result is None, and the deformation as it
-    was, if ``is_stopped`` says during the fit that it is to stop.
+    Without depth they start in front of the points around them, or, as ``model.start`` says, at the sparse points, as
+    if everything is assumed to be dynamic; without visible points at random positions in the scene's box. If nothing is
+    dynamic, there are none. What was tracked starts on its tracks. The deformation is fitted unless
+    ``schedule.fit_motion`` is 0, as in plans where it cannot be. The result is None, and the deformation as it was, if
+    ``is_stopped`` says during the fit that it is to stop.
     """
     if isinstance(deformation, SplineDeformation):
         tracks = find_tracks(capture, views)
@@ -125,6 +125,8 @@ def dynamic_gaussians(
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:
         return DynamicStart(Gaussians.empty(0, config.model.sh_degree))
+    if config.model.start == "plain" and not found.depth_known:
+        return DynamicStart(_gaussians_at_points(config, capture, views, generator))
     start: DynamicPoints | None = found
     if config.schedule.fit_motion and found.depth_known:
         times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
@@ -138,11 +140,10 @@ def dynamic_gaussians(
 def _gaussians_at_dynamic_points(
     config: TrainConfig, capture: Capture, found: DynamicPoints, generator: torch.Generator
 ) -> Gaussians:
-    """Gaussians at a random subset of points; in the scene's box if ``model.start`` says so or none is left."""
+    """Gaussians at a random subset of points; in the scene's box if none is left."""
     max_count = config.model.dynamic_points
     found = found.chosen(subsample(found.positions, max_count, generator))
-    is_uniform = config.model.start == "plain" and not found.depth_known
-    if is_uniform or len(found.positions) == 0:
+    if len(found.positions) == 0:
         return gaussians_in_box(capture, max_count, config, generator)
     largest = math.inf if found.depth_known else MAX_SCALE * capture.view_size
     return gaussians_at(found.positions, found.colors, config.model, largest)
