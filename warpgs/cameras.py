@@ -191,6 +191,14 @@ class Camera:
         return torch.cartesian_prod(y, x).flip(1)
 
     @property
+    def shown(self) -> Bool[Tensor, "H W"] | None:
+        """[H, W] which pixels show anything: those in the circular image of a fisheye; None if all do."""
+        if self.distortion is None or math.isinf(self.distortion.circle):
+            return None
+        slopes = (self.pixel_centers - self.K[:2, 2]) / self.K.diagonal()[:2]
+        return self.distortion.shows(slopes).reshape(self.height, self.width)
+
+    @property
     def pinhole(self) -> "Camera":
         """The camera without the distortion of its lens and with a global shutter."""
         return dataclasses.replace(self, distortion=None, motion=None)

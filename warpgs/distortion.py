@@ -61,15 +61,18 @@ class Distortion:
         coefficients: [12], [4] or [0].
         limit: How far from the axis the formula holds: the radius on the plane z = 1 beyond which a radial lens
             continues linearly, or the angle beyond which other lenses see nothing [radians].
+        circle: Angle at which the circular image of a fisheye ends; pixels beyond it show nothing [radians]. Gaussians
+            are rendered up to ``limit`` all the same, because they reach into the circle.
 
     Raises:
-        ValueError: On an unknown lens, a wrong shape or dtype, or a limit that is not positive and finite, or for a
-            fisheye above 178 degrees.
+        ValueError: On an unknown lens, a wrong shape or dtype, a limit that is not positive and finite, or for a
+            fisheye above 178 degrees, or a circle that is not positive.
     """
 
     lens: Literal["radial", "fisheye", "equirectangular"]
     coefficients: Float[Tensor, " C"]
     limit: float
+    circle: float = math.inf
 
     def __post_init__(self) -> None:
         if self.lens not in NUM_COEFFICIENTS:
@@ -78,7 +81,10 @@ class Distortion:
         limit = as_number("limit", self.limit)
         if not 0.0 < limit < math.inf or (self.lens == "fisheye" and limit > MAX_ANGLE):
             raise ValueError(f"limit must be positive and finite, of a fisheye at most {MAX_ANGLE:.4g}, got {limit}")
+        if not (circle := as_number("circle", self.circle)) > 0.0:
+            raise ValueError(f"circle must be positive, got {circle}")
         object.__setattr__(self, "limit", limit)
+        object.__setattr__(self, "circle", circle)
 
     @staticmethod
     def radial(coefficients: Coefficients, K: Float[Tensor, "3 3"], size: tuple[int, int]) -> "Distortion":
@@ -117,9 +123,10 @@ class Distortion:
         distances = _distances(K, size)
         theta = torch.linspace(0.0, MAX_ANGLE, NUM_SAMPLES, dtype=torch.float64)
         bent = _bent_angle(theta, k.detach().double().cpu())
-        # A circular image leaves the corners black.
+        # A circular image leaves the corners black; it ends where the lens turns, if that is before the corner.
         at_corner, turns = _checked_profile(theta, bent, distances.norm().item(), k, distances.min().item())
-        return Distortion("fisheye", k, min(max(MARGIN * at_corner, math.pi / 2), turns))
+        circle = turns if at_corner == turns else math.inf
+        return Distortion("fisheye", k, min(max(MARGIN * at_corner, math.pi / 2), turns), circle)
 
     @staticmethod
     def equirectangular() -> "Distortion":
@@ -140,10 +147,14 @@ class Distortion:
         return self.lens != "radial"
 
     def sees(self, viewed: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
-        """Whether points in camera space are where the formula of the lens holds."""
+        """Whether points in camera space are where the formula of the lens holds, and inside its circle."""
         if self.measures_distance:
-            return torch.atan2(viewed[:, :2].norm(dim=1), viewed[:, 2]) <= self.limit
+            return torch.atan2(viewed[:, :2].norm(dim=1), viewed[:, 2]) <= min(self.limit, self.circle)
         return (viewed[:, 2] > 0.0) & (viewed[:, :2].norm(dim=1) < self.limit * viewed[:, 2])
+
+    def shows(self, bent: Float[Tensor, "P 2"]) -> Bool[Tensor, " P"]:
+        """Whether positions [focal lengths] are inside the circular image; all are, if that is not known."""
+        return bent.norm(dim=1) <= _bent_angle(bent.new_full((1,), self.circle), self.coefficients.to(bent))
 
     def bend(self, viewed: Float[Tensor, "P 3"]) -> Float[Tensor, "P 2"]:
         """[P, 2] where the lens puts points in camera space, from the principal point [focal lengths]."""
@@ -168,7 +179,7 @@ class Distortion:
             theta = _inverse(lambda theta: _bent_angle(theta, k), radius, self.limit)
             across = position * (theta.sin() / radius.clamp_min(TINY))[:, None]
             rays = torch.cat([across, theta.cos()[:, None]], 1)
-            is_found = (_bent_angle(theta, k) - radius).abs() < MAX_RESIDUAL
+            is_found = ((_bent_angle(theta, k) - radius).abs() < MAX_RESIDUAL) & (theta <= self.circle)
         elif self.lens == "equirectangular":
             (sin_lon, sin_lat), (cos_lon, cos_lat) = position.sin().unbind(1), position.cos().unbind(1)
             rays = torch.stack([cos_lat * sin_lon, sin_lat, cos_lat * cos_lon], 1)

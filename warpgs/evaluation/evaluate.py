@@ -100,8 +100,8 @@ def evaluate(
     indices = progress(range(len(capture.val)), "evaluating", quiet)
     for index, frame in zip(indices, capture.frames(capture.val), strict=True):
         camera = frame.camera.to(device) if align is None else align(frame)
-        rendering = scene.render(camera, branches=True)
         truth = frame.image.to(device).float() / 255.0
+        rendering = _where_shown(scene.render(camera, branches=True), camera, truth)
         views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
         if on_view is not None:
             on_view(index, frame, truth, rendering)
@@ -122,11 +122,20 @@ def check_views(capture: Capture, quiet: bool = True) -> None:
         pass
 
 
+def _where_shown(rendering: Rendering, camera: Camera, truth: Tensor) -> Rendering:
+    """The rendering with a joint image that is the ground truth where the camera shows nothing."""
+    if (shown := camera.shown) is None:
+        return rendering
+    image = torch.where(shown[..., None], rendering.joint.image, truth)
+    return rendering._replace(joint=rendering.joint._replace(image=image))
+
+
 def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:
     static, covisible = (
         None if mask is None else mask.to(image.device) for mask in (frame.static_mask, frame.covisible)
     )
-    comparison = Comparison(image, truth, static, covisible, lpips)
+    shown = frame.camera.to(image.device).shown
+    comparison = Comparison(image, truth, static, covisible, shown, lpips)
     return ViewMetrics(
         frame.name, frame.camera.time, {k: known(measure(comparison)) for k, measure in of_views().items()}
     )

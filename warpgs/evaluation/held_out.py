@@ -26,7 +26,7 @@ HELD_OUT_WIDTH = 320
 def render_and_compare(scene: TrainedScene, frame: Frame) -> tuple[Float[Tensor, "H W 3"], float]:
     """The joint image of a frame's camera, and its PSNR [dB]."""
     image = scene.render(frame.camera).joint.image.clamp(0, 1)
-    return image, psnr(image, frame.image.to(image.device).float() / 255.0)
+    return image, psnr(image, frame.image.to(image.device).float() / 255.0, frame.camera.to(image.device).shown)
 
 
 class HeldOut:

@@ -39,6 +39,7 @@ class Comparison:
         truth: Ground truth in [0, 1].
         static: Whether a pixel is static; None without a mask.
         covisible: Whether training cameras see a pixel; None unless the capture says so, as iPhone captures do.
+        shown: ``Camera.shown``; where it is false, the image is the ground truth.
         lpips: Network of LPIPS; None without its weights.
     """
 
@@ -46,6 +47,7 @@ class Comparison:
     truth: Float[Tensor, "H W 3"]
     static: Bool[Tensor, "H W"] | None
     covisible: Bool[Tensor, "H W"] | None
+    shown: Bool[Tensor, "H W"] | None
     lpips: Lpips | None
 
     @property

@@ -26,6 +26,8 @@ def within(
 
     def measure(view: Comparison) -> float | None:
         pixels: Tensor | None = getattr(view, region)
+        if pixels is not None and view.shown is not None:
+            pixels = pixels & view.shown
         if pixels is None or not bool(pixels.any()):
             return None
         return float(function(view.image, view.truth, pixels))
@@ -42,8 +44,8 @@ def _masked_lpips(view: Comparison) -> float | None:
 
 
 METRICS: dict[str, Metric] = {
-    "psnr": Metric("PSNR", lambda view: psnr(view.image, view.truth), unit="dB", digits=2, better="higher"),
-    "ssim": Metric("SSIM", lambda view: ssim(view.image, view.truth), better="higher"),
+    "psnr": Metric("PSNR", lambda view: psnr(view.image, view.truth, view.shown), unit="dB", digits=2, better="higher"),
+    "ssim": Metric("SSIM", lambda view: ssim(view.image, view.truth, view.shown), better="higher"),
     "ms_ssim": Metric(
         "MS-SSIM",
         lambda view: ms_ssim(view.image, view.truth),

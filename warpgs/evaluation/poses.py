@@ -49,7 +49,7 @@ def alignment(scene: TrainedScene, unit: float) -> Align:
         if not scene.config.optim.poses:
             return camera
         truth = frame.image.to(scene.device).float() / 255.0
-        region = None if frame.covisible is None else frame.covisible.to(scene.device)
+        region = camera.shown if frame.covisible is None else frame.covisible.to(scene.device)
         return aligned_camera(scene.splats(camera.time), camera, truth, unit, scene.config.render_settings, region)
 
     return align

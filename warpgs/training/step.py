@@ -25,7 +25,7 @@ from . import optimizer as optim
 from .acceleration import sample_paths
 from .density import make_strategy
 from .loss_terms import TERMS
-from .losses import LossInputs
+from .losses import LossInputs, only_shown
 from .schedule import IterationPlan, Phase
 from .step_inputs import StepInputs
 
@@ -170,6 +170,7 @@ class Step:
             splats = replace(splats, opacities=opacities)
         backgrounds, offsets = self._backgrounds(), self.density.screen_offsets if phase.densifies else None
         rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
+        rendering = only_shown(rendering, view, backgrounds[2])
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
         paths = self._paths(view) if phase.use_deformation and config.acceleration > 0 else None
@@ -233,6 +234,7 @@ class Step:
     @torch.no_grad()
     def _add_to_sums(self, terms: dict[str, Tensor], rendering: Rendering, view: View) -> None:
         """Adds the terms and the PSNR to the sums since the last check, without waiting for the device."""
-        error = mse_loss(rendering.joint.image.clamp(0, 1), view.image).clamp_min(MIN_SQUARED_ERROR)
+        error = mse_loss(rendering.joint.image.clamp(0, 1), view.image)
+        error = (error if view.shown is None else error / view.shown.float().mean()).clamp_min(MIN_SQUARED_ERROR)
         values = [terms.get(name, self._zero) for name in TERMS]
         self._sums.addcmul_(torch.stack([*values, error.log10(), self._one]), self._inputs.scales)

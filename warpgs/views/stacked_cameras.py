@@ -35,8 +35,8 @@ class StackedCameras:
 
     @property
     def have_one_lens(self) -> bool:
-        """Whether all lenses are of one kind and limit, which are constants of a CUDA graph."""
-        return len({None if lens is None else (lens.lens, lens.limit) for lens in self.lenses}) == 1
+        """Whether all lenses are of one kind, limit and circle, which are constants of a CUDA graph."""
+        return len({None if lens is None else (lens.lens, lens.limit, lens.circle) for lens in self.lenses}) == 1
 
     def at(self, index: Int64[Tensor, "1"], lens: Distortion | None, size: tuple[int, int]) -> Camera:
         """The camera of an index on the device, at time 0.
@@ -72,4 +72,4 @@ def _reach(camera: Camera) -> float:
     rays = camera.to("cpu").rays(torch.cartesian_prod(x, y))
     slopes = rays[:, :2].norm(dim=1)
     reach = slopes / rays[:, 2] if camera.distortion.lens == "radial" else torch.atan2(slopes, rays[:, 2])
-    return float(reach.nan_to_num(0.0).max())
+    return float(reach.nan_to_num(camera.distortion.circle).max())

@@ -34,6 +34,7 @@ class View(NamedTuple):
         static_mask: [H, W] M of the paper, true where static.
         mask_border: [H, W] true within the margin of a border of the mask; None without a margin.
         inverse_depth: [H, W] inverse depth up to a scale and an offset, NaN where unknown.
+        shown: [H, W] ``Camera.shown``: whether a pixel shows anything; None if all do.
         mask_trust: Factor of the terms that follow the mask: 1, or 0 if the mask is not trusted.
     """
 
@@ -43,6 +44,7 @@ class View(NamedTuple):
     static_mask: Bool[Tensor, "H W"]
     mask_border: Bool[Tensor, "H W"] | None
     inverse_depth: Float[Tensor, "H W"]
+    shown: Bool[Tensor, "H W"] | None
     mask_trust: Float[Tensor, ""]
 
 
@@ -245,12 +247,14 @@ class Views:
         time, mask_trust = (values.index_select(0, index)[0] for values in (self._times, self.mask_trust))
         height, width = pixels.static_mask.shape
         image = pixels.image.float() / 255.0
+        camera = self._cameras.at(index, lens, (width, height))
         return View(
-            self._corrected(self._cameras.at(index, lens, (width, height)), index),
+            self._corrected(camera, index),
             time,
             image if self._gains is None else image / self._gains.index_select(0, index)[0],
             pixels.static_mask,
             pixels.mask_border,
             pixels.inverse_depth.float(),
+            camera.shown,
             mask_trust,
         )

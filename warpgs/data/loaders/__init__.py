@@ -10,6 +10,7 @@ from typing import Protocol
 from warpgs.config.builtin import NAMES, PREFIX
 from warpgs.data.capture import Capture
 from warpgs.data.colmap_folders import find_models
+from warpgs.data.image_circle import with_image_circle
 from warpgs.data.masks import check_perturbation
 from warpgs.data.missing import missing_folder
 from warpgs.data.readout import with_readout
@@ -89,6 +90,7 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     layout = layout or FALLBACK
     capture = LOADERS[layout].load(root, options)
     _require_sides(root, capture)
+    capture = with_image_circle(capture)
     capture.layout = describe_layout(root, layout, dataset)
     try:
         return with_readout(capture, capture.readout if options.readout is None else options.readout)
