@@ -267,3 +267,13 @@ def test_a_path_through_cameras_of_two_sizes_has_one_size_and_one_field_of_view(
     path = paths.training_path(ring(5, 2, ((64, 48), (32, 24))), 9)
     assert {c.size for c in path} == {(64, 48)}
     assert [float(c.K[0, 0]) for c in path] == pytest.approx([float(camera().K[0, 0])] * 9)
+
+
+def test_a_cropped_view_has_the_rolling_shutter_of_its_rows():
+    motion = torch.tensor([[0.0, 0.0, 0.0], [0.4, 0.1, 0.0]])
+    whole = dataclasses.replace(camera(), motion=motion)
+    cropped = paths.filling(whole, (64, 24))
+    rows, columns, depth = torch.tensor([2, 12, 20]), torch.tensor([10, 30, 50]), torch.full((3,), 2.0)
+    assert torch.allclose(
+        cropped.unproject(rows, columns, depth), whole.unproject(rows + 12, columns, depth), atol=1e-6
+    )

@@ -305,4 +305,5 @@ def filling(camera: Camera, size: tuple[int, int]) -> Camera:
     K = scaled.K.clone()
     K[0, 2] -= (scaled.width - width) // 2
     K[1, 2] -= (scaled.height - height) // 2
-    return dataclasses.replace(camera, K=K, width=width, height=height)
+    motion = None if camera.motion is None else camera.motion * (height / scaled.height)  # of the rows that are left
+    return dataclasses.replace(camera, K=K, width=width, height=height, motion=motion)
