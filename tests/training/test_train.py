@@ -482,14 +482,15 @@ def test_a_run_is_trained_and_evaluated_on_recorded_frames_with_the_lens_or_a_ce
         assert np.array_equal(capture.frame(name).image.numpy(), recorded)
 
 
-def test_a_run_on_undistorted_frames_is_evaluated_but_not_resumed(config, tmp_path):
+@pytest.mark.parametrize("written", [{"undistort": True}, {}])
+def test_a_run_on_undistorted_frames_is_evaluated_but_not_resumed(config, tmp_path, written):
     data = shutil.copytree(config.data, tmp_path / "bent")
     run = warpgs.train(dataclasses.replace(config, data=data))
-    edit_json(run.folder / "config.json", distortion=None, undistort=True)
+    edit_json(run.folder / "config.json", distortion=None, **written)
     assert warpgs.train(TrainConfig(resume=run.folder)).config.distortion
     for path in (data / "camera").iterdir():
         edit_json(path, radial_distortion=[0.1, 0.0, 0.0])
-    edit_json(run.folder / "config.json", distortion=None, undistort=True)
+    edit_json(run.folder / "config.json", distortion=None, **written)
     with pytest.raises(ValueError, match=r"cannot be resumed: its frames were undistorted"):
         warpgs.train(TrainConfig(resume=run.folder))
     assert "PSNR" in evaluate_run.evaluate_run(run.folder, quiet=True)

@@ -109,7 +109,8 @@ def require_recorded(folder: Path, is_distorted: bool) -> None:
         ValueError: If it was. Such runs can be evaluated, viewed and exported.
     """
     path = folder / NAME
-    if is_distorted and read_json(path, max_bytes=MAX_BYTES).get("undistort"):
+    written = read_json(path, max_bytes=MAX_BYTES)
+    if is_distorted and written.get("undistort", "distortion" not in written):  # all were, before there was the option
         raise ValueError(
             f"{path} cannot be resumed: its frames were undistorted, and this version trains on them as they were "
             "recorded; the version that began the run can"
