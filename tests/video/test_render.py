@@ -15,6 +15,7 @@ from tests.errors import error_line
 from tests.video.test_writer import frames_of
 from warpgs import rendering
 from warpgs.cli import main
+from warpgs.distortion import Distortion
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
@@ -130,6 +131,25 @@ def test_cameras_move_and_time_passes_unless_one_is_given(run, monkeypatch, tmp_
     cameras = cameras_of(run, monkeypatch, tmp_path, path=path, time=time)
     assert [c.time for c in cameras] == times
     assert (cameras[0].position - cameras[1].position).norm() > 0.01
+
+
+@pytest.mark.parametrize("path", render_run.PATHS_OF_OPTION["lens"])
+def test_a_path_is_filmed_through_a_pinhole_or_the_lens_that_recorded_the_view(
+    run, capture, monkeypatch, tmp_path, path
+):
+    def through_a_lens(self, quiet):
+        return dataclasses.replace(capture, cameras={n: bent(c) for n, c in capture.cameras.items()})
+
+    monkeypatch.setattr(Run, "open_corrected_capture", through_a_lens)
+    for lens, distorted in ((None, False), ("pinhole", False), ("recorded", True)):
+        with monkeypatch.context() as patch:
+            cameras = cameras_of(run, patch, tmp_path, path=path, lens=lens)
+        assert [camera.distortion is not None for camera in cameras] == [distorted] * 3
+
+
+def bent(camera):
+    """A camera with barrel distortion."""
+    return dataclasses.replace(camera, distortion=Distortion.radial([-0.1], camera.K, camera.size))
 
 
 def test_keyframes_are_followed(run, capture, scene, tmp_path):
@@ -276,6 +296,7 @@ def test_bullet_time_follows_the_training_camera_unless_a_view_is_given(run, cap
         ({"path": "frozen", "view": "a"}, "--view is for .* not for frozen"),
         ({"path": "fixed", "time": 0.0}, "--time is for frozen, spiral, bullet, not for fixed"),
         ({"path": "moving", "time": 0.5}, "--time is for .* not for moving"),
+        ({"lens": "recorded"}, "--lens is for fixed, frozen, moving, spiral, bullet, not for views"),
         ({"keyframes": Path("a.json"), "time": 0.5}, "--time is for .* not for keyframes"),
         ({"keyframes": Path("a.json"), "view": "a"}, "--view is for .* not for keyframes"),
         ({"keyframes": Path("a.json"), "truth": True}, "--truth is for views, not for keyframes"),

@@ -44,6 +44,9 @@ class Render:
     opacity in grey."""
     transparent: bool = False
     """Leave pixels transparent where the layer is; for PNG, GIF and WebP."""
+    lens: Literal["pinhole", "recorded"] | None = None
+    """Lens of the camera along a path: a pinhole of the same focal length (default), or the one that filmed the start
+    view, or the middle evaluation view."""
     truth: bool = False
     """For views: show the ground truth beside the rendered image."""
     scale: float = 1.0

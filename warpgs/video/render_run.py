@@ -27,6 +27,7 @@ PATHS_OF_OPTION = {
     "truth": ("views",),
     "view": ("fixed", "spiral", "bullet"),
     "time": ("frozen", "spiral", "bullet"),
+    "lens": ("fixed", "frozen", "moving", "spiral", "bullet"),
     "frames": ("fixed", "frozen", "moving", "spiral", "bullet", "keyframes"),
 }
 """Camera paths that an option applies to; the other options apply to all."""
@@ -53,6 +54,9 @@ def render_run(options: Render) -> str:
     dynamic = means[len(scene.scene.static) :]
     centers = torch.stack([capture.cameras[name].position for name in capture.train])
     cameras, names = _cameras(options, capture, dynamic, means)
+    if options.lens == "recorded":
+        distortion = _start_view(options, capture).distortion
+        cameras = [dataclasses.replace(camera, distortion=distortion) for camera in cameras]
     camera_paths.BoundingSphere.around(means, centers).check(cameras, str(options.keyframes or options.path_name))
     name = options.keyframes.stem if options.keyframes else options.path_name
     folder = options.out or options.run_folder / "render" / name
@@ -114,9 +118,9 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
         return _numbered(path if options.path == "moving" else frozen)
     if options.path == "bullet":
         stays = options.view is not None
-        path = [_start_view(options, capture)] if stays else camera_paths.replay(capture, max(frames, FRAMES))
+        path = [_start_view(options, capture).pinhole] if stays else camera_paths.replay(capture, max(frames, FRAMES))
         return _numbered(camera_paths.bullet(path, (dynamic, means), time, frames))
-    camera = _start_view(options, capture)
+    camera = _start_view(options, capture).pinhole
     if options.path == "fixed":
         return _numbered(camera_paths.at_times(camera, camera_paths.evenly_spaced(frames)))
     times = camera_paths.evenly_spaced(frames) if options.time is None else [options.time] * frames
@@ -139,11 +143,11 @@ def _number(k: int) -> str:
 
 
 def _start_view(options: Render, capture: Capture) -> Camera:
-    """The camera from which the fixed and spiral paths start, and the bullet path with --view."""
+    """The camera from which the fixed and spiral paths start, and the bullet path with --view; its lens is --lens."""
     name = options.view or camera_paths.middle_view(capture)
     if name not in capture.cameras:
         raise ValueError(missing_view(capture, name))
-    return capture.cameras[name].pinhole
+    return capture.cameras[name]
 
 
 def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.ndarray]) -> str:
