@@ -26,19 +26,29 @@ def project_here(*tensors, near=0.01, antialias=False):
 
 
 def reference_here(*tensors, near=0.01, antialias=False):
-    view = View(CAMERA.viewmat.double(), CAMERA.K.double(), *CAMERA.size)
-    return reference(Geometry(*tensors), view, near=near, antialias=antialias)
+    return reference(Geometry(*tensors), in_double(VIEW), near=near, antialias=antialias)
+
+
+def in_double(view: View) -> View:
+    parts = {name: getattr(view, name) for name in ("viewmat", "K", "distortion", "motion")}
+    return view._replace(**{name: part.double() for name, part in parts.items() if part is not None})
+
+
+def assert_same_values(splats, expected, tolerance: float) -> None:
+    """Compares splats, and which are visible, with the reference's."""
+    *values, visible = expected
+    assert torch.equal(splats.radii.gt(0).all(-1), visible)
+    for actual, value in zip(splats[:4], values, strict=True):
+        assert relative_error(actual[visible], value[visible]) < tolerance
 
 
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("near", [0.01, 3.5])
 def test_values_equal_the_reference(antialias, near):
     splats = project_here(*inputs(), near=near, antialias=antialias)
-    *values, visible = reference_here(*(t.double() for t in inputs()), near=near, antialias=antialias)
-    assert 10 < visible.sum() < NUM
-    assert torch.equal(splats.radii.gt(0).all(-1), visible)
-    for actual, expected in zip(splats[:4], values, strict=True):
-        assert relative_error(actual[visible], expected[visible]) < 1e-6
+    expected = reference_here(*(t.double() for t in inputs()), near=near, antialias=antialias)
+    assert 10 < expected[-1].sum() < NUM
+    assert_same_values(splats, expected, 1e-6)
 
 
 OUTPUTS = {"means2d": slice(3, 5), "conics": slice(5, 8), "depths": slice(1, 2), "opacities": slice(2, 3)}

@@ -50,7 +50,7 @@ def psnr(trained_on: Capture, evaluated_on: Capture, folder, config: TrainConfig
     return value
 
 
-def test_recorded_frames_are_learned_at_least_as_well_as_undistorted_ones(capture, tmp_path):
+def test_training_on_recorded_frames_is_at_least_as_good_as_on_undistorted_frames(capture, tmp_path):
     recorded = psnr(capture, capture, tmp_path / "recorded")
     assert recorded > psnr(changed(capture, undistorted), capture, tmp_path / "undistorted")
 
