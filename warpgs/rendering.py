@@ -40,6 +40,10 @@ class Layer(NamedTuple):
     alpha: Float[Tensor, "H W"]
     depth: Float[Tensor, "H W"] | None
 
+    def only_where(self, shown: Bool[Tensor, "H W"], elsewhere: Float[Tensor, "... C"]) -> "Layer":
+        """The layer with an image that has other colours where pixels show nothing (``Camera.shown``)."""
+        return self._replace(image=torch.where(shown[..., None], self.image, elsewhere))
+
     @property
     def inverse_depth(self) -> Float[Tensor, "H W"]:
         """[H, W] inverse depth; NaN where empty."""

@@ -101,8 +101,10 @@ def evaluate(
     for index, frame in zip(indices, capture.frames(capture.val), strict=True):
         camera = frame.camera.to(device) if align is None else align(frame)
         truth = frame.image.to(device).float() / 255.0
-        rendering = _where_shown(scene.render(camera, branches=True), camera, truth)
-        views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, lpips))
+        rendering, shown = scene.render(camera, branches=True), camera.shown
+        if shown is not None:
+            rendering = rendering._replace(joint=rendering.joint.only_where(shown, truth))
+        views.append(_measure(frame, rendering.joint.image.clamp(0, 1), truth, shown, lpips))
         if on_view is not None:
             on_view(index, frame, truth, rendering)
     cameras = [capture.cameras[name].to(device) for name in capture.val or capture.train]
@@ -122,19 +124,10 @@ def check_views(capture: Capture, quiet: bool = True) -> None:
         pass
 
 
-def _where_shown(rendering: Rendering, camera: Camera, truth: Tensor) -> Rendering:
-    """The rendering with a joint image that is the ground truth where the camera shows nothing."""
-    if (shown := camera.shown) is None:
-        return rendering
-    image = torch.where(shown[..., None], rendering.joint.image, truth)
-    return rendering._replace(joint=rendering.joint._replace(image=image))
-
-
-def _measure(frame: Frame, image: Tensor, truth: Tensor, lpips: Lpips | None) -> ViewMetrics:
+def _measure(frame: Frame, image: Tensor, truth: Tensor, shown: Tensor | None, lpips: Lpips | None) -> ViewMetrics:
     static, covisible = (
         None if mask is None else mask.to(image.device) for mask in (frame.static_mask, frame.covisible)
     )
-    shown = frame.camera.to(image.device).shown
     comparison = Comparison(image, truth, static, covisible, shown, lpips)
     return ViewMetrics(
         frame.name, frame.camera.time, {k: known(measure(comparison)) for k, measure in of_views().items()}

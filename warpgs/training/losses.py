@@ -11,7 +11,7 @@ from warpgs.config import LossConfig
 from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.splats import Splats
 from warpgs.ops.ssim import l1_and_ssim
-from warpgs.rendering import Layer, Rendering
+from warpgs.rendering import Rendering
 from warpgs.views.views import View
 
 from .schedule import IterationPlan, Phase
@@ -63,20 +63,19 @@ def only_shown(rendering: Rendering, view: View, background: Float[Tensor, "3"])
     """The rendering with images that are right where the view shows nothing, so that nothing is learned there.
 
     Args:
-        rendering: Of the view.
+        rendering: Of the view, with the images of the branches.
         view: The view, static where it shows nothing.
         background: [3] colour behind the dynamic image.
     """
     if view.shown is None:
         return rendering
-    shown = view.shown[..., None]
-
-    def filled(layer: Layer | None, truth: Tensor) -> Layer | None:
-        return None if layer is None else layer._replace(image=torch.where(shown, layer.image, truth))
-
-    joint = rendering.joint._replace(image=torch.where(shown, rendering.joint.image, view.image))
-    static, dynamic = filled(rendering.static, view.image), filled(rendering.dynamic, background)
-    return rendering._replace(joint=joint, static=static, dynamic=dynamic)
+    assert rendering.static is not None
+    assert rendering.dynamic is not None
+    return rendering._replace(
+        joint=rendering.joint.only_where(view.shown, view.image),
+        static=rendering.static.only_where(view.shown, view.image),
+        dynamic=rendering.dynamic.only_where(view.shown, background),
+    )
 
 
 def image_loss(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], ssim_weight: float) -> Float[Tensor, ""]:
