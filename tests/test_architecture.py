@@ -26,7 +26,7 @@ ORDER = [
     "synthetic",
     "captures",
     "runs",
-    "video",
+    "video editing",
     "evaluation",
     "initialization",
     "training prepare",

@@ -1,4 +1,4 @@
-"""A run's scene as clouds: the exported Gaussians look like the rendered scene, and the least visible are omitted."""
+"""A run's scene as clouds: the exported Gaussians look like the rendered scene."""
 
 import dataclasses
 
@@ -52,41 +52,3 @@ def test_gaussians_with_values_that_are_not_finite_are_reported():
     cloud.means[1, 2] = np.nan
     cloud.sh[3, 0, 1] = np.inf
     assert cloud.finite.tolist() == [True, False, True, False, True]
-
-
-def test_the_least_visible_gaussians_are_omitted(clouds):
-    clouds = scenes.clouds()
-    hidden = torch.arange(40) % 2 == 0
-    clouds.scene.scene.static.means[hidden] += torch.tensor([0.0, 0.0, -90.0])
-    camera = scenes.camera(time=0.5)
-    kept = clouds.most_visible(40, [camera])
-    assert set(kept.rows.tolist()).isdisjoint(torch.where(hidden)[0].tolist())
-    assert (kept.visibility([]) == clouds.visibility([camera])[kept.rows]).all()  # which is not measured again
-    assert (scenes.image(kept.at(0.5), camera) - rendered(clouds, camera)).abs().max() < 1e-4
-
-
-def test_visibility_is_the_maximum_over_cameras_of_summed_blend_weights():
-    clouds = scenes.clouds()
-    away = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -90], [0, 0, 0, 1]])
-    behind = dataclasses.replace(scenes.camera(), viewmat=away)
-    seen, unseen = clouds.visibility([scenes.camera()]), clouds.visibility([behind])
-    assert (unseen == 0).all()
-    assert seen.max() > 1
-    assert (clouds.visibility([behind, scenes.camera(), behind]) == seen).all()
-
-
-def test_the_rows_are_the_same_at_every_time(clouds):
-    kept = clouds.most_visible(11, [scenes.camera()])
-    assert all((kept.at(time).means == clouds.at(time).means[kept.rows]).all() for time in (0.0, 0.6))
-    assert len(kept.at(0.3)) == 11
-
-
-@pytest.mark.parametrize("count", [60, 10_000])
-def test_a_small_scene_is_kept_whole(clouds, count):
-    assert clouds.most_visible(count, [scenes.camera()]) is clouds
-
-
-@pytest.mark.parametrize("count", [0, -3])
-def test_a_count_that_is_not_positive_is_refused(clouds, count):
-    with pytest.raises(ValueError, match=f"expected at least 1 Gaussian to keep, got {count}"):
-        clouds.most_visible(count, [])

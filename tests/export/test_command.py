@@ -15,6 +15,7 @@ from warpgs.captures import opening
 from warpgs.captures.opening import load_capture
 from warpgs.cli import main
 from warpgs.data.capture import Capture
+from warpgs.editing.options import Editing, Edits
 from warpgs.export import orientation, page
 from warpgs.export.clouds import Clouds
 from warpgs.export.compressed import read_compressed
@@ -125,7 +126,7 @@ def test_a_page_has_the_name_of_the_run_folder_as_its_title(run, monkeypatch):
     assert start_view(clouds_of(Path()), None, keys=2, seconds=1.0).title == "the run"
 
 
-@pytest.mark.parametrize("options", [{"max_gaussians": 9}, {}])
+@pytest.mark.parametrize("options", [{"editing": Editing(Edits(max_gaussians=9))}, {}])
 def test_a_page_opens_its_capture_once(run, tmp_path, monkeypatch, options):
     opened, read = [], opening.open_capture
     monkeypatch.setattr(opening, "open_capture", lambda *arguments: opened.append(arguments) or read(*arguments))
@@ -147,7 +148,7 @@ def test_files_are_written_into_the_run_folder_by_default(run):
 
 
 def test_max_gaussians_limits_the_number_of_gaussians(run, tmp_path):
-    export(run, tmp_path, max_gaussians=12)
+    export(run, tmp_path, editing=Editing(Edits(max_gaussians=12)))
     assert len(read_standard(tmp_path / "out" / "scene.ply")) == 12
 
 
@@ -246,7 +247,9 @@ def write_count(job):
 
 def test_another_format_takes_one_entry(run, tmp_path, monkeypatch):
     monkeypatch.setitem(WRITERS, "count", Writer(write_count, ("time",)))
-    assert export(run, tmp_path, format="count", time=0.5, max_gaussians=7).startswith("written to ")
+    assert export(run, tmp_path, format="count", time=0.5, editing=Editing(Edits(max_gaussians=7))).startswith(
+        "written to "
+    )
     assert (tmp_path / "out" / "count.txt").read_text() == "7"
     with pytest.raises(ValueError, match=r"--frames is for --format .*, not for count"):
         export(run, tmp_path, format="count", frames=2)
@@ -329,7 +332,7 @@ def test_a_page_without_a_capture_starts_at_a_default_camera_that_sees_the_scene
 
 
 def test_max_gaussians_works_without_a_capture(stranded, tmp_path):
-    export(stranded, tmp_path, max_gaussians=9)
+    export(stranded, tmp_path, editing=Editing(Edits(max_gaussians=9)))
     assert len(read_standard(tmp_path / "out" / "scene.ply")) == 9
 
 
@@ -357,7 +360,7 @@ def test_data_replaces_the_folder_of_the_capture(stranded, data, tmp_path):
         ({"out": Path("a.html")}, "--out a.html is a file of --format html, not of ply"),
         ({"out": Path("a.ply"), "frames": 2}, "--frames writes several files: --out must be a folder, not a file as a"),
         ({"out": Path("a.ply"), "layers": "apart"}, "--layers apart writes several files: --out must be a folder"),
-        ({"max_gaussians": 0}, "--max-gaussians must be at least 1"),
+        ({"editing": Editing(Edits(max_gaussians=0))}, "--max-gaussians must be at least 1"),
         ({"format": "html", "max_megabytes": -1.0}, "--max-megabytes must be positive"),
         ({"format": "html", "max_megabytes": 0.001}, r"the page would hold .* use about --max-gaussians \d+"),
     ],

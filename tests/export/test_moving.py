@@ -19,7 +19,9 @@ KEYS, SECONDS = 5, 2.0
 
 def job(clouds, finished_run, folder, **options):
     options = {"keys": KEYS, "seconds": SECONDS, "up": "-y", **options}
-    return Job(Run.open(finished_run, "cpu"), Export(finished_run, out=folder, quiet=True, **options), clouds)
+    job = Job(Run.open(finished_run, "cpu"), Export(finished_run, out=folder, quiet=True, **options))
+    job.clouds = clouds
+    return job
 
 
 def expected(clouds, time):

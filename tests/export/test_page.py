@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.export import node, scenes
 from tests.export.pages import read_page
+from warpgs.editing.contribution import contribution
 from warpgs.export import page
 from warpgs.export.baking import PARTS, STEPS, TEXEL, bake, nearest_to_identity, octaves_of, texture_bytes
 from warpgs.export.cloud import sigmoid
@@ -40,7 +41,7 @@ def start(title="scene", track=False, filmed=None):
 
 @pytest.fixture(scope="module")
 def weights(clouds):
-    return clouds.visibility([scenes.camera(time=time) for time in evenly_spaced(KEYS)])
+    return contribution(clouds.scene, [scenes.camera(time=time) for time in evenly_spaced(KEYS)]).largest.numpy()
 
 
 @pytest.fixture(scope="module")

@@ -139,7 +139,7 @@ def bake(
         cloud_at: The scene at a time, in the same rows at every time.
         times: At least one, evenly spaced over [0, 1].
         precision: All steps of quantisation are divided by it.
-        weights: How visible each Gaussian is, in any unit (``Clouds.visibility``); the same for all if None.
+        weights: How visible each Gaussian is, in any unit (``contribution``); the same for all if None.
     """
     static_colors, dynamic_geometry, finite = [], [], np.ones(1, bool)
     for time in times:

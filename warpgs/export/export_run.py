@@ -8,11 +8,9 @@ from warpgs.errors import not_one_of
 from warpgs.runs.run import Run
 from warpgs.video.camera_paths import MAX_FRAMES
 
-from .clouds import Clouds
 from .job import Job
 from .options import Export
 from .page import MAX_KEYS
-from .start_camera import sample_cameras
 from .writers import WRITERS
 
 COUNTS = {"frames": MAX_FRAMES, "keys": MAX_KEYS}
@@ -36,16 +34,12 @@ def export_run(options: Export) -> str:
     _check_out(options)
     _check_values(options)
     run = Run.open(options.run_folder, "cpu", options.data)
-    job = Job(run, options, Clouds(run.trained_scene()))
-    if options.max_gaussians is not None:
-        cameras = sample_cameras(job.clouds, job.capture)
-        job.clouds = job.clouds.most_visible(options.max_gaussians, cameras, options.quiet)
-    writer = WRITERS[options.format]
-    summary = writer.write(job)
-    notes = [] if writer.has_background else [_background_note(run)]
+    job, writer = Job(run, options), WRITERS[options.format]
+    if not writer.has_background:
+        job.notes.append(_background_note(run))
     if job.clouds.scene.scene.light is not None:
-        notes.append(REFLECTIONS_NOTE)
-    return "\n".join([summary, *notes])
+        job.notes.append(REFLECTIONS_NOTE)
+    return "\n".join([writer.write(job), *job.notes])
 
 
 def _background_note(run: Run) -> str:
@@ -96,8 +90,6 @@ def _check_values(options: Export) -> None:
         raise ValueError("--frames are spread over all times: omit --time")
     if options.time is not None and not 0 <= options.time <= 1:
         raise ValueError(f"--time must be in [0, 1], got {options.time}")
-    if options.max_gaussians is not None and options.max_gaussians < 1:
-        raise ValueError(f"--max-gaussians must be at least 1, got {options.max_gaussians}")
     for name, maximum in COUNTS.items():
         value = getattr(options, name)
         if value is not None and not 1 <= value <= maximum:

@@ -1,7 +1,7 @@
 """What an export format is, and what it gets to write."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from warpgs.data.capture import Capture
+from warpgs.editing.edited_scene import with_edits
 from warpgs.runs.run import Run
 from warpgs.video.camera_paths import UP
 
@@ -25,12 +26,20 @@ class Job:
     Attributes:
         run: The run to export.
         options: Options of the command.
-        clouds: The Gaussians to write.
+        notes: Lines to print after the summary.
     """
 
     run: Run
     options: Export
-    clouds: Clouds
+    notes: list[str] = field(default_factory=list)
+
+    @cached_property
+    def clouds(self) -> Clouds:
+        """The Gaussians to write: those that edits leave."""
+        run, editing, quiet = self.run, self.options.editing, self.options.quiet
+        scene, notes = with_edits(run.trained_scene(), run.folder, editing, lambda: self.capture, quiet)
+        self.notes += notes
+        return Clouds(scene)
 
     @property
     def folder(self) -> Path:

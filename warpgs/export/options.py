@@ -1,10 +1,13 @@
 """Options of ``warpgs export``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from warpgs.command_line.parsing import RunFolder
+from warpgs.editing.options import Editing
 
 
 @dataclass(frozen=True)
@@ -32,12 +35,11 @@ class Export:
     """Number of key times of html, usd and 4dgs, between which programs interpolate; 30 by default."""
     seconds: float | None = None
     """Duration of the scene in html, usd and 4dgs [s]; 5 by default."""
-    max_gaussians: int | None = None
-    """Export at most this many Gaussians: those that the training cameras see most of."""
     max_megabytes: float | None = None
     """Refuse to write a page whose Gaussians take more memory than this, before compression [MB]; 256 by default."""
     precision: float | None = None
     """Divide the quantisation steps of a page by this; 1 by default, for about 40 dB against the scene itself."""
+    editing: Annotated[Editing, tyro.conf.arg(name="")] = field(default_factory=Editing)
     data: Path | None = None
     """Current folder of the capture, if it was moved; a page starts at one of its cameras."""
     quiet: bool = False

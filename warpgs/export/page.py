@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from warpgs.command_line.progress import progress
+from warpgs.editing.contribution import contribution, sample_cameras
 from warpgs.files import write_bytes
 from warpgs.video.camera_paths import evenly_spaced
 from warpgs.video.filmed import DRAG_LIMIT, REACH, Filmed
@@ -28,7 +29,7 @@ from .baking import PARTS, Baked, Branch, bake, texture_bytes
 from .job import Job, Writer
 from .moving import KEYS, SECONDS
 from .packing import to_planes
-from .start_camera import StartView, sample_cameras, start_view
+from .start_camera import StartView, start_view
 from .transform import Levels
 
 VERSION = 3
@@ -173,7 +174,8 @@ def _write(job: Job) -> str:
     keys = options.keys or KEYS
     _check_memory(job, keys)
     start = start_view(job.clouds, job.capture, keys, options.seconds or SECONDS)
-    weights = job.clouds.visibility(sample_cameras(job.clouds, job.capture), options.quiet)
+    scene = job.clouds.scene
+    weights = contribution(scene, sample_cameras(scene, job.capture), options.quiet).largest.numpy()
     times = progress(evenly_spaced(keys), "baking", options.quiet)
     baked = bake(job.clouds.at, times, options.precision or 1.0, weights)
     size = write_page(path, baked, start, options.quiet)

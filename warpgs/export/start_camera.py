@@ -9,18 +9,11 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import Color
 from warpgs.data.capture import COLORS, Capture, background_color
-from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.video import camera_paths
 from warpgs.video.filmed import Filmed
 
 from .cloud import Cloud
 from .clouds import Clouds
-
-SIDES = ((0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0))
-"""Sides that default cameras look from, as directions (x, z)."""
-
-NUM_SAMPLES = 24
-"""Number of cameras that decide which Gaussians are visible."""
 
 
 @dataclass(frozen=True)
@@ -52,17 +45,6 @@ class StartView:
     max_alpha: float
     background: Color = COLORS["black"]
     filmed: Filmed | None = None
-
-
-def sample_cameras(clouds: Clouds, capture: Capture | None) -> list[Camera]:
-    """Training cameras, evenly spaced in the order of time; without a capture, default cameras from four sides."""
-    if capture is not None:
-        names = capture.in_time(capture.train)
-        chosen = evenly_spaced_indices(len(names), NUM_SAMPLES)
-        return [capture.cameras[names[k]] for k in chosen]
-    times = camera_paths.evenly_spaced(NUM_SAMPLES)
-    scene = camera_paths.BoundingSphere.around(_means(clouds.at(0.5)))
-    return [camera_paths.default_camera(scene, SIDES[k % len(SIDES)], time) for k, time in enumerate(times)]
 
 
 def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: float) -> StartView:

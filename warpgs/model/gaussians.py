@@ -1,7 +1,9 @@
 """Gaussians as they are optimized."""
 
+import copy
+
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from warpgs.ops.activation import Raw
@@ -94,6 +96,15 @@ class Gaussians(nn.Module):
     def raw(self) -> Raw:
         """The parameters as arguments of ``ops.activation``."""
         return Raw(self.means, self.quats, self.log_scales, self.logit_opacities, self.sh_dc, self.sh_rest)
+
+    def select(self, kept: Bool[Tensor, " N"]) -> "Gaussians":
+        """Copies of the Gaussians to keep, in their order."""
+        selected = copy.copy(self)
+        selected._parameters = {
+            name: None if p is None else nn.Parameter(p.detach()[kept], p.requires_grad)
+            for name, p in self._parameters.items()
+        }
+        return selected
 
     @torch.no_grad()
     def gather(self, parents: Int64[Tensor, " M"]) -> None:

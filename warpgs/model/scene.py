@@ -1,5 +1,6 @@
 """The scene of the paper: static Gaussians whose appearance changes, dynamic Gaussians that are deformed (Eq. 5)."""
 
+import copy
 import dataclasses
 
 import torch
@@ -91,6 +92,13 @@ class SplitScene(nn.Module):
         return SplitScene(
             static, dynamic, config, torch.zeros(3, dtype=torch.float32), torch.ones(3, dtype=torch.float32)
         )
+
+    def select(self, static: Bool[Tensor, " S"], dynamic: Bool[Tensor, " D"]) -> "SplitScene":
+        """A scene of copies of the Gaussians to keep, with the same networks."""
+        selected = copy.copy(self)
+        selected._modules = dict(self._modules)
+        selected.static, selected.dynamic = self.static.select(static), self.dynamic.select(dynamic)
+        return selected
 
     def splats(
         self,

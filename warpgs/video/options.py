@@ -1,13 +1,14 @@
 """Options of ``warpgs render``."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from warpgs.command_line.parsing import RunFolder
+from warpgs.editing.options import Editing
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
 
@@ -55,6 +56,7 @@ class Render:
     """Image size instead, such as 1080x1920; the view is cropped to it, not stretched [px]."""
     supersample: int = 1
     """Render at this multiple of the size, then average down."""
+    editing: Annotated[Editing, tyro.conf.arg(name="")] = field(default_factory=Editing)
     data: Path | None = None
     """Current folder of the capture, if it was moved."""
     device: Literal["cuda", "cpu"] | None = None

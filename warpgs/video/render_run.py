@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, missing_view
+from warpgs.editing.edited_scene import with_edits
 from warpgs.files import remove_numbered, write_png
 from warpgs.runs.run import Run
 
@@ -48,8 +50,9 @@ def render_run(options: Render) -> str:
     """
     _check(options)
     run = Run.open(options.run_folder, options.device, options.data)
-    scene = run.trained_scene()
-    capture = run.open_corrected_capture(options.quiet)
+    opened = cache(partial(run.open_corrected_capture, options.quiet))
+    scene, notes = with_edits(run.trained_scene(), run.folder, options.editing, opened, options.quiet)
+    capture = opened()
     means = scene.splats(_time(options)).means.cpu()
     dynamic = means[len(scene.scene.static) :]
     centers = torch.stack([capture.cameras[name].position for name in capture.train])
@@ -60,7 +63,8 @@ def render_run(options: Render) -> str:
     camera_paths.BoundingSphere.around(means, centers).check(cameras, str(options.keyframes or options.path_name))
     name = options.keyframes.stem if options.keyframes else options.path_name
     folder = options.out or options.run_folder / "render" / name
-    return _write(options, folder, names, render_frames(options, capture, scene, cameras, names))
+    summary = _write(options, folder, names, render_frames(options, capture, scene, cameras, names))
+    return "\n".join([summary, *notes])
 
 
 def _check(options: Render) -> None:

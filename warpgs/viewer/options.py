@@ -1,11 +1,12 @@
 """Options of ``warpgs view``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import tyro
 
 from warpgs.command_line.parsing import RunFolder
+from warpgs.editing.options import Editing
 
 
 @dataclass(frozen=True)
@@ -23,5 +24,6 @@ class View:
     repeated. By default only of the viewer's own page."""
     while_training: bool = False
     """Follow a run in training: show what is trained now. Nothing is read while no browser is connected."""
+    editing: Annotated[Editing, tyro.conf.arg(name="")] = field(default_factory=Editing)
     device: Literal["cuda", "cpu"] | None = None
     """Device to render on; CUDA by default if there is a GPU."""

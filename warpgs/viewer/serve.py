@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from warpgs.command_line.version import install_command
+from warpgs.editing.options import Editing
 from warpgs.errors import one_line
 from warpgs.posix import lower_priority
 from warpgs.runs import config_file
@@ -36,6 +37,8 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
     from .server import Viewer, check_address
 
     allowed = allowed_origins(options.allow_origin)
+    if options.while_training and options.editing != Editing():
+        raise ValueError("--while-training shows the scene as it is trained, without edits")
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)  # a browser has disconnected
     if options.while_training and not options.run_folder.exists():
         report(f"waiting for a training to create {options.run_folder} (press Ctrl-C to stop)")
@@ -46,6 +49,9 @@ def serve(options: View, report: Callable[[str], None], warn: Callable[[str], No
     if options.while_training and source.device.type == "cpu":
         lower_priority(NICENESS)
     training = training_cameras(source, warn)
+    if not options.while_training:
+        for note in source.edit(options.editing, None if training is None else training.capture):
+            report(note)
     with Viewer(source, training, options.host, options.port, allowed, warn) as viewer:
         host = f"[{options.host}]" if ":" in options.host else options.host
         gc.collect()

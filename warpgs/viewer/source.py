@@ -6,6 +6,9 @@ from pathlib import Path
 
 import torch
 
+from warpgs.data.capture import Capture
+from warpgs.editing.edited_scene import with_edits
+from warpgs.editing.options import Editing
 from warpgs.errors import one_line
 from warpgs.runs import preview
 from warpgs.runs.run import Device, Run
@@ -39,6 +42,12 @@ class Source:
         self._loaded: tuple[Path, int] | None = None
         self._checked = -POLL_SECONDS
         self._scene: TrainedScene | None = None if follow else run.trained_scene()
+
+    def edit(self, editing: Editing, capture: Capture | None) -> list[str]:
+        """Edits the scene, which is not one that is followed; returns lines about it. Raises as ``with_edits``."""
+        assert self._scene is not None
+        self._scene, notes = with_edits(self._scene, self.run.folder, editing, lambda: capture)
+        return notes
 
     @property
     def device(self) -> torch.device:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
+from warpgs.editing.contribution import blend_weights_in, weakest
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 from warpgs.rendering import DEFAULTS, render
@@ -100,7 +101,7 @@ def prune(at: Adaptation) -> None:
 def blend_weights(
     scene: SplitScene, views: Views, phase: Phase, settings: RenderSettings = DEFAULTS
 ) -> Float[Tensor, " N"]:
-    """Sum of alpha times transmittance of every Gaussian, static ones first, over the joint images of all views.
+    """Sum of the blend weights of every Gaussian, static ones first, over the images of all views.
 
     Args:
         scene: The scene.
@@ -108,13 +109,10 @@ def blend_weights(
         phase: Says which networks and which degree of spherical harmonics are in use.
         settings: How images are rendered.
     """
-    settings = replace(settings, statistics=True)
 
     def weights_in(view: View) -> tuple[Tensor]:
         splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
-        weights = render(splats, view.camera, settings=settings).weights
-        assert weights is not None
-        return (weights,)
+        return (blend_weights_in(splats, view.camera, settings),)
 
     total = torch.zeros(len(scene.static) + len(scene.dynamic), dtype=torch.float32, device=views.device)
     for (weights,) in views.map(weights_in):
@@ -124,9 +122,7 @@ def blend_weights(
 
 @torch.no_grad()
 def remove_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " N"], fraction: float) -> int:
-    """Removes the Gaussians with the smallest weights, which hold at most a fraction of all; returns their number.
-
-    If none has any weight, all stay: what no view shows may still be shown later.
+    """Removes the ``weakest`` Gaussians; returns their number.
 
     Args:
         scene: Changed in place, together with the optimizer's moments.
@@ -134,10 +130,7 @@ def remove_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " 
         weights: [N] from ``blend_weights``.
         fraction: In [0, 1).
     """
-    ascending, order = weights.double().sort()
-    is_weak = torch.zeros_like(weights, dtype=torch.bool)
-    total = ascending.sum()
-    is_weak[order[(ascending.cumsum(0) <= fraction * total) & (total > 0)]] = True
+    is_weak = weakest(weights, fraction)
     branches = (scene.static, scene.dynamic)
     for gaussians, weak in zip(branches, is_weak.split([len(gaussians) for gaussians in branches]), strict=True):
         remove(gaussians, optimizer, weak.nonzero()[:, 0])

@@ -1,0 +1,150 @@
+"""The scene of a run with its edits: Gaussians are removed from a copy in memory."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from warpgs.data.capture import Capture
+from warpgs.runs.trained import TrainedScene
+from warpgs.video.camera_paths import evenly_spaced
+
+from .contribution import Contribution, contribution, sample_cameras, weakest
+from .edits_file import check, edits_in_use, save_edits
+from .options import Box, Editing, Edits
+
+NUM_TIMES = 9
+"""Number of times at which positions and opacities are looked at."""
+
+FLOATERS = 0.003
+"""Maximum part of all blend weights that floaters hold together."""
+
+NUM_NEIGHBORS = 16
+MIN_ISOLATION = 1.5
+"""Isolation from which a Gaussian is isolated (``isolation``)."""
+
+Opened = Callable[[], Capture | None]
+"""Opens the capture of a run; None if it cannot be opened."""
+
+
+def with_edits(
+    scene: TrainedScene, folder: Path, editing: Editing, open_capture: Opened, quiet: bool = True
+) -> tuple[TrainedScene, list[str]]:
+    """A scene with the edits that are in use, which are saved if the options ask for it; and lines about them.
+
+    Args:
+        scene: Of the newest checkpoint; not changed.
+        folder: Its run folder.
+        editing: The options.
+        open_capture: Opens the capture; called only if an edit needs the training cameras.
+        quiet: Whether to hide the progress bar.
+
+    Raises:
+        ValueError: As ``edits_in_use`` and ``edited``.
+        OSError: If edits cannot be saved.
+    """
+    edits = edits_in_use(folder, editing)
+    before, notes = _number(scene), []
+    if edits != Edits():
+        capture = open_capture() if edits.drop_floaters or edits.max_gaussians is not None else None
+        scene = edited(scene, edits, capture, quiet)
+        notes.append(f"edits keep {_number(scene):,} of {before:,} Gaussians")
+    if editing.save_edits:
+        notes.append(f"edits saved as {save_edits(folder, editing, edits)}")
+    return scene, notes
+
+
+def edited(scene: TrainedScene, edits: Edits, capture: Capture | None = None, quiet: bool = True) -> TrainedScene:
+    """A scene without the Gaussians that edits remove; the same one if they remove none.
+
+    Args:
+        scene: Not changed.
+        edits: What to remove.
+        capture: Its training cameras see how much each Gaussian contributes. Without it, default cameras do so for
+            ``max_gaussians``.
+        quiet: Whether to hide the progress bar.
+
+    Raises:
+        ValueError: If an edit is out of its range, removes all Gaussians, or needs a capture.
+    """
+    check(edits)
+    if edits.crop is not None or edits.min_opacity is not None:
+        scene = _kept(scene, _inside_and_opaque(scene, edits))
+    if not edits.drop_floaters and (edits.max_gaussians is None or _number(scene) <= edits.max_gaussians):
+        return scene
+    if edits.drop_floaters and capture is None:
+        raise ValueError("--drop-floaters needs the training cameras, but the capture cannot be opened")
+    contributions = contribution(scene, sample_cameras(scene, capture), quiet)
+    kept = torch.ones_like(contributions.total, dtype=torch.bool)
+    if edits.drop_floaters:
+        kept &= ~floaters(scene, contributions)
+    if edits.max_gaussians is not None:
+        order = torch.where(kept, contributions.total, -1.0).sort(descending=True, stable=True).indices
+        kept[order[edits.max_gaussians :]] = False
+    return _kept(scene, kept)
+
+
+def floaters(scene: TrainedScene, contributions: Contribution) -> Bool[Tensor, " N"]:
+    """Which Gaussians are floaters: isolated, and seen by few cameras or little by them.
+
+    They hold less than ``FLOATERS`` of all blend weights together, and are isolated at the start, the middle and the
+    end.
+    """
+    times = evenly_spaced(3) if len(scene.scene.dynamic) else [0.0]
+    least = np.minimum.reduce([isolation(scene.splats(time).means.cpu().numpy()) for time in times])
+    isolated = torch.from_numpy(least > MIN_ISOLATION).to(scene.device)
+    return isolated & weakest(contributions.total, FLOATERS)
+
+
+def isolation(points: np.ndarray) -> np.ndarray:
+    """[N] how far each of [N, 3] points is from its neighbours, relative to how far these are from theirs.
+
+    The mean distance to the ``NUM_NEIGHBORS`` nearest points over the median of the same of these points: a local
+    outlier factor (Breunig et al. 2000), about 1 in regions of any density. At most as many points have no neighbours
+    to compare: theirs is 1.
+    """
+    if len(points) <= NUM_NEIGHBORS:
+        return np.ones(len(points))
+    distances, neighbors = cKDTree(points).query(points, NUM_NEIGHBORS + 1)
+    own = distances[:, 1:].mean(1)
+    around = np.median(own[neighbors[:, 1:]], axis=1)
+    return np.where(own > 0, own / np.maximum(around, np.finfo(np.float64).tiny), 0.0)
+
+
+def _inside_and_opaque(scene: TrainedScene, edits: Edits) -> Bool[Tensor, " N"]:
+    """Which Gaussians are inside of the box at any time, and as opaque as they have to be at any time."""
+    inside = torch.zeros(_number(scene), dtype=torch.bool, device=scene.device)
+    opacities = torch.zeros_like(inside, dtype=torch.float32)
+    low, high = _corners(edits.crop, scene.device)
+    for time in evenly_spaced(NUM_TIMES):
+        splats = scene.splats(time)
+        inside |= ((splats.means >= low) & (splats.means <= high)).all(1)
+        opacities = opacities.maximum(splats.opacities)
+    return inside & (opacities >= (edits.min_opacity or 0.0))
+
+
+def _corners(crop: Box | None, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The lowest and the highest corner of a box; of all space without one."""
+    corners = torch.tensor(crop or (*[-torch.inf] * 3, *[torch.inf] * 3), dtype=torch.float32, device=device).view(2, 3)
+    return corners.amin(0), corners.amax(0)
+
+
+def _kept(scene: TrainedScene, kept: Bool[Tensor, " N"]) -> TrainedScene:
+    """The scene with the Gaussians to keep; the same one if these are all."""
+    if kept.all():
+        return scene
+    if not kept.any():
+        means = scene.splats(0.5).means.cpu().numpy()
+        low, high = (" ".join(f"{v:.3g}" for v in np.nanquantile(means, q, axis=0)) for q in (0.01, 0.99))
+        raise ValueError(f"edits leave no Gaussian; most have their centres between {low} and {high}")
+    num_static = len(scene.scene.static)
+    selected = scene.scene.select(kept[:num_static], kept[num_static:])
+    return TrainedScene(selected, scene.config, scene.metadata)
+
+
+def _number(scene: TrainedScene) -> int:
+    return len(scene.scene.static) + len(scene.scene.dynamic)
