@@ -8,7 +8,9 @@ from warpgs.errors import not_one_of
 from warpgs.runs.run import Run
 from warpgs.video.camera_paths import MAX_FRAMES
 
-from .job import Job
+from .camera_writers import CAMERA_FORMATS, CameraSet, write_cameras
+from .job import Job, Writer
+from .moving import SECONDS
 from .options import Export
 from .page import MAX_KEYS
 from .writers import WRITERS
@@ -39,7 +41,17 @@ def export_run(options: Export) -> str:
         job.notes.append(_background_note(run))
     if job.clouds.scene.scene.light is not None:
         job.notes.append(REFLECTIONS_NOTE)
-    return "\n".join([writer.write(job), *job.notes])
+    cameras = [] if options.cameras is None else [_cameras(job, writer)]  # first: without a capture nothing is written
+    return "\n".join([writer.write(job), *cameras, *job.notes])
+
+
+def _cameras(job: Job, writer: Writer) -> str:
+    """Writes the cameras next to the file of the scene; returns a summary."""
+    options, folder = job.options, job.folder.parent if job.options.is_out_file(writer.suffix) else job.folder
+    if job.capture is None:
+        raise ValueError(f"--cameras needs the cameras of the capture: {job.capture_note.partition('because ')[2]}")
+    cameras = CameraSet.of(job.capture, job.rotation(writer.y_up), options.seconds or SECONDS)
+    return write_cameras(folder / "cameras", options.cameras or "", cameras)
 
 
 def _background_note(run: Run) -> str:
@@ -52,7 +64,10 @@ def _check_format(options: Export) -> None:
     """Refuses an unknown format, and options that do not apply to the format."""
     if options.format not in WRITERS:
         raise ValueError(not_one_of("--format", options.format, WRITERS))
+    if options.cameras is not None and options.cameras not in CAMERA_FORMATS:
+        raise ValueError(not_one_of("--cameras", options.cameras, CAMERA_FORMATS))
     specific = {name for writer in WRITERS.values() for name in writer.options}
+    specific -= {"seconds"} if options.cameras == "usd" else set()
     for field in dataclasses.fields(Export):
         if field.name not in specific or field.name in WRITERS[options.format].options:
             continue

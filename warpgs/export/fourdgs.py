@@ -62,4 +62,4 @@ def _arrays(cloud: Cloud, velocity: np.ndarray, time: float, seconds: float) -> 
     }
 
 
-FOURDGS = Writer(write_fourdgs, OPTIONS, ".4dgs")
+FOURDGS = Writer(write_fourdgs, OPTIONS, ".4dgs", y_up=True)

@@ -61,14 +61,14 @@ class Job:
         capture, error = self._capture
         return f"default cameras, because {error}" if capture is None else f"cameras of {capture.name}"
 
-    def rotation(self, y_up: bool) -> Float64[np.ndarray, "3 3"]:
+    def rotation(self, y_up: bool | None) -> Float64[np.ndarray, "3 3"]:
         """From the scene's coordinates to those of the files.
 
         Args:
-            y_up: Whether readers assume that y points up instead of down.
+            y_up: As of ``Writer``.
         """
         up = self._up[0]
-        if up is None:
+        if up is None or y_up is None:
             return np.eye(3)
         return orientation.upright(up, y_up)
 
@@ -108,9 +108,11 @@ class Writer(NamedTuple):
         options: Names of those options of ``Export`` that apply to this format but not to every other.
         suffix: End of its file names, with the dot; ``--out`` may be such a file. Empty if it has to be a folder.
         has_background: Whether its files have the colour behind the Gaussians; the summary names it otherwise.
+        y_up: Whether readers assume that y points up instead of down; None if files keep the scene's coordinates.
     """
 
     write: Callable[[Job], str]
     options: tuple[str, ...]
     suffix: str = ""
     has_background: bool = False
+    y_up: bool | None = False

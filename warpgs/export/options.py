@@ -31,10 +31,13 @@ class Export:
     up: Literal["capture", "x", "y", "z", "-x", "-y", "-z", "scene"] = "capture"
     """What is up in the files: the capture's upward direction, estimated from its training cameras, or an axis of the
     scene; scene keeps the scene's coordinates, in which the capture's cameras fit."""
+    cameras: str | None = None
+    """Also write the cameras as training left them, in the coordinates of the file, to the folder cameras: colmap,
+    nerfstudio or blender (transforms.json; of D-NeRF), or usd (OpenUSD, moving)."""
     keys: int | None = None
     """Number of key times of html, usd and 4dgs, between which programs interpolate; 30 by default."""
     seconds: float | None = None
-    """Duration of the scene in html, usd and 4dgs [s]; 5 by default."""
+    """Duration of the scene in html, usd and 4dgs, and of --cameras usd [s]; 5 by default."""
     max_megabytes: float | None = None
     """Refuse to write a page whose Gaussians take more memory than this, before compression [MB]; 256 by default."""
     precision: float | None = None

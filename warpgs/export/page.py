@@ -183,5 +183,5 @@ def _write(job: Job) -> str:
     return f"{path}: {count}, {size / 1e6:.1f} MB\nviews and camera path: {job.capture_note}"
 
 
-PAGE = Writer(_write, ("keys", "seconds", "max_megabytes", "precision"), ".html", has_background=True)
+PAGE = Writer(_write, ("keys", "seconds", "max_megabytes", "precision"), ".html", has_background=True, y_up=None)
 """The format "html"."""

@@ -23,7 +23,8 @@ def per_time(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool 
         write_cloud: Writes a cloud and returns the size of the file [bytes].
         y_up: Whether readers assume that y points up, as in glTF, instead of down, as in the PLY file of 3DGS.
     """
-    return Writer(partial(_write, suffix, write_cloud, y_up), OPTIONS, Path(f"scene{suffix}").suffix)
+    write = partial(_write, suffix, write_cloud, y_up)
+    return Writer(write, OPTIONS, Path(f"scene{suffix}").suffix, y_up=y_up)
 
 
 def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool, job: Job) -> str:

@@ -42,12 +42,13 @@ def write_usd(job: Job) -> str:
     for k, cloud in enumerate(clouds_over_time(job, keys)):
         for field, is_dynamic in zip(fields, (False, True), strict=True):
             field.add(cloud.select(cloud.is_dynamic == is_dynamic), float(k))
-    _save(stage, path)
+    save_stage(stage, path)
     count = f"{fields[0].count:,} static and {fields[1].count:,} dynamic Gaussians at {keys} key times"
     return f"{path}: {count}, {path.stat().st_size / 1e6:.1f} MB\n{job.up_note}"
 
 
-def _save(stage: Any, path: Path) -> None:
+def save_stage(stage: Any, path: Path) -> None:
+    """Writes a stage as binary OpenUSD; raises OSError if it cannot be written."""
     with atomic_path(path) as partial:
         file = partial.with_suffix(".usdc")  # USD chooses the format by the suffix
         try:
@@ -119,4 +120,4 @@ def _to_usd(name: str, values: np.ndarray) -> Any:
     return types.get(name, Vt.Vec3fArray).FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
-USD = Writer(write_usd, OPTIONS, ".usdc")
+USD = Writer(write_usd, OPTIONS, ".usdc", y_up=True)

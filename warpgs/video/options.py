@@ -27,6 +27,9 @@ class Render:
     time; the same path over time; a spiral around the middle view; bullet time, which stops on the same path."""
     keyframes: Path | None = None
     """JSON file of keyframes to follow instead (docs/viewing.md)."""
+    cameras: Path | None = None
+    """Film at exactly the cameras of a transforms.json or of the folder of a COLMAP model instead, in the coordinates
+    of the scene."""
     out: Path | None = None
     """Output folder; RUN/render/PATH by default."""
     view: str | None = None
@@ -79,5 +82,7 @@ class Render:
 
     @property
     def path_name(self) -> str:
-        """The path, or "keyframes"."""
+        """The path, or "keyframes" or "cameras"."""
+        if self.cameras is not None:
+            return "cameras"
         return "keyframes" if self.keyframes is not None else self.path or "views"

@@ -17,7 +17,7 @@ from warpgs.editing.edited_scene import with_edits
 from warpgs.files import remove_numbered, write_png
 from warpgs.runs.run import Run
 
-from . import camera_paths, keyframes, writer
+from . import camera_paths, given_cameras, keyframes, writer
 from .encodings import ENCODINGS
 from .frames import COLORED, render_frames
 from .options import Render
@@ -60,16 +60,18 @@ def render_run(options: Render) -> str:
     if options.lens == "recorded":
         distortion = _start_view(options, capture).distortion
         cameras = [dataclasses.replace(camera, distortion=distortion) for camera in cameras]
-    camera_paths.BoundingSphere.around(means, centers).check(cameras, str(options.keyframes or options.path_name))
-    name = options.keyframes.stem if options.keyframes else options.path_name
+    given = options.keyframes or options.cameras
+    camera_paths.BoundingSphere.around(means, centers).check(cameras, str(given or options.path_name))
+    name = given.stem if given else options.path_name
     folder = options.out or options.run_folder / "render" / name
     summary = _write(options, folder, names, render_frames(options, capture, scene, cameras, names))
     return "\n".join([summary, *notes])
 
 
 def _check(options: Render) -> None:
-    if options.keyframes is not None and options.path is not None:
-        raise ValueError("--keyframes define the path: omit --path")
+    given = [name for name in ("path", "keyframes", "cameras") if getattr(options, name) is not None]
+    if len(given) > 1:
+        raise ValueError(f"--{given[-1]} define the path: omit --{given[0]}")
     for name, paths in PATHS_OF_OPTION.items():
         value = getattr(options, name)
         if value is not None and value is not False and options.path_name not in paths:
@@ -112,6 +114,8 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
     frames, time = options.frames or FRAMES, _time(options)
     if options.keyframes is not None:
         return _numbered(keyframes.read_path(options.keyframes, capture, frames))
+    if options.cameras is not None:
+        return _numbered(given_cameras.read_cameras(options.cameras, capture))
     if options.path_name == "views":
         if not capture.val:
             raise ValueError(f"{capture.name} has no evaluation views; choose another --path")

@@ -1,0 +1,74 @@
+"""Cameras as OpenUSD: one prim that moves along the training cameras, one along those of evaluation.
+
+A prim UsdGeomCamera looks along -z with y up. Its ``focalLength`` and apertures are tenths of a scene unit, which
+other programs show as millimetres: only their ratios matter. Apertures are the image at the focal length, their offsets
+the principal point. Time code k is k / (N - 1) of the duration, for N training cameras; programs interpolate between.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from warpgs.cameras import Camera
+
+from .camera_set import CameraSet
+from .moving import required
+from .usd import save_stage
+
+FOCAL_LENGTH = 50.0
+"""Focal length of all cameras [tenths of a scene unit]."""
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+"""From x right, y up, z backward to x right, y down, z forward."""
+
+NEAR, FAR = 0.01, 1e4
+"""Clipping range [scene units]."""
+
+
+def write_usd_cameras(folder: Path, cameras: CameraSet) -> None:
+    """Writes cameras.usdc; raises OSError if it cannot be written or usd-core is not installed."""
+    path = folder / "cameras.usdc"
+    Usd, UsdGeom, Gf = (required(path, f"pxr.{name}", "usd-core") for name in ("Usd", "UsdGeom", "Gf"))
+    stage = Usd.Stage.CreateInMemory()
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Cameras").GetPrim())
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    last = max(1, len(cameras.train) - 1)
+    stage.SetTimeCodesPerSecond(last / cameras.seconds)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(last)
+    for prim, names in (("training", cameras.train), ("evaluation", [*cameras.cameras.keys() - {*cameras.train}])):
+        by_time = {cameras.cameras[name].time: cameras.cameras[name] for name in sorted(names, reverse=True)}
+        if by_time:
+            camera = UsdGeom.Camera.Define(stage, f"/Cameras/{prim}")
+            camera.CreateClippingRangeAttr(Gf.Vec2f(NEAR, FAR))
+            camera.CreateFocalLengthAttr(FOCAL_LENGTH)
+            _animate(camera, {last * time: by_time[time] for time in sorted(by_time)}, path)
+    save_stage(stage, path)
+
+
+def _animate(prim: Any, cameras: dict[float, Camera], path: Path) -> None:
+    """Sets the pose and the apertures of a prim at time codes."""
+    Gf, UsdGeom = required(path, "pxr.Gf", "usd-core"), required(path, "pxr.UsdGeom", "usd-core")
+    move = prim.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble)
+    turn = prim.AddOrientOp(UsdGeom.XformOp.PrecisionDouble)
+    apertures = (
+        *(prim.CreateHorizontalApertureAttr(), prim.CreateVerticalApertureAttr()),
+        *(prim.CreateHorizontalApertureOffsetAttr(), prim.CreateVerticalApertureOffsetAttr()),
+    )
+    for code, camera in cameras.items():
+        to_world = camera.viewmat[:3, :3].double().numpy().T @ OPENCV_FROM_OPENGL
+        x, y, z, w = Rotation.from_matrix(to_world).as_quat().tolist()
+        move.Set(Gf.Vec3d(*camera.position.double().tolist()), code)
+        turn.Set(Gf.Quatd(w, x, y, z), code)
+        for attribute, value in zip(apertures, _apertures(camera), strict=True):
+            attribute.Set(value, code)
+
+
+def _apertures(camera: Camera) -> tuple[float, float, float, float]:
+    """Width and height of the image at the focal length, and how far right and up of the axis its middle is."""
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    x, y = FOCAL_LENGTH / fx, FOCAL_LENGTH / fy
+    return x * camera.width, y * camera.height, x * (0.5 * camera.width - cx), y * (cy - 0.5 * camera.height)

@@ -1,0 +1,100 @@
+"""Cameras from files, to film at exactly: a COLMAP model, or a transforms.json as nerfstudio and Blender have it.
+
+They are in the coordinates of the scene. ``applied_transform`` of a transforms.json says how these became those of the
+file, and is undone.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgs.cameras import Camera
+from warpgs.data.camera_files import is_rotation
+from warpgs.data.capture import Capture
+from warpgs.data.colmap import load_model
+from warpgs.data.colmap_folders import find_models
+from warpgs.data.lens import Lens
+from warpgs.data.loaders.transforms import Transforms
+from warpgs.files import natural_order, read_numbers
+
+from .camera_paths import MAX_FRAMES, evenly_spaced, filling
+
+INDEX = "transforms.json"
+
+
+def read_cameras(path: Path, capture: Capture) -> list[Camera]:
+    """The cameras of a file, with the size of the first one, in the order of their times, else of their names.
+
+    Without times, those that are called like frames of the capture have their times; others are evenly spaced.
+
+    Args:
+        path: A transforms.json, or a folder that has one or a COLMAP model.
+        capture: The capture of the run.
+
+    Raises:
+        ValueError: If there is no such file, it is damaged, a lens is not supported or a time is outside of [0, 1].
+    """
+    if path.is_dir() and not (path / INDEX).is_file():
+        named, times = _of_colmap(path)
+    else:
+        named, times = _of_transforms(path / INDEX if path.is_dir() else path)
+    if len(named) > MAX_FRAMES:
+        raise ValueError(f"{path} has {len(named):,} cameras, the maximum is {MAX_FRAMES:,}")
+    names = [Path(name).stem for name, _ in named]
+    if times is None and all(name in capture.cameras for name in names):
+        times = [capture.cameras[name].time for name in names]
+    by_time = sorted(zip(times or evenly_spaced(len(named)), (camera for _, camera in named), strict=True), key=_time)
+    first = by_time[0][1]
+    cameras = [dataclasses.replace(camera, time=float(time)) for time, camera in by_time]
+    return [camera if camera.size == first.size else filling(camera, first.size) for camera in cameras]
+
+
+Named = list[tuple[str, Camera]]
+"""Cameras with the names of their images, at least one, in the order of these."""
+
+
+def _time(item: tuple[float, Camera]) -> float:
+    return item[0]
+
+
+def _of_colmap(folder: Path) -> tuple[Named, None]:
+    """The cameras of a model, which has no times."""
+    found = find_models(folder)
+    model = load_model(found[0].folder if found else folder)
+    images = sorted(model.images, key=lambda image: natural_order(image.name))
+    if not images:
+        raise ValueError(f"{folder} has no image with a pose")
+    return [(image.name, _camera(image.lens, image.pose)) for image in images], None
+
+
+def _of_transforms(path: Path) -> tuple[Named, Sequence[float] | None]:
+    """The cameras of a transforms.json, and their times if it has any."""
+    transforms = Transforms(path)
+    frames = sorted(transforms.frames, key=lambda frame: natural_order(str(frame.get("file_path"))))
+    applied = np.eye(4)[:3]
+    if "applied_transform" in transforms.fields:
+        applied = read_numbers(path, transforms.fields, "applied_transform", (3, 4))
+        if not is_rotation(applied[:, :3]):
+            raise ValueError(f"{path}: applied_transform must be a rotation and a translation")
+    named = []
+    for frame in frames:
+        has_size = {"w", "h"} <= {*transforms.fields, *frame}
+        lens = transforms.lens(frame, Path() if has_size else transforms.image(frame))
+        pose = transforms.pose(frame)
+        moved = np.hstack([pose[:, :3] @ applied[:, :3], pose[:, :3] @ applied[:, 3:] + pose[:, 3:]])
+        named.append((str(frame.get("file_path")), _camera(lens, moved)))
+    given = transforms.times(frames, "time")
+    if given is not None and not all(0 <= time <= 1 for time in given[1]):
+        raise ValueError(f"{path}: time must be in [0, 1], from the first frame of the capture to the last")
+    return named, None if given is None else given[1]
+
+
+def _camera(lens: Lens, pose: np.ndarray) -> Camera:
+    """The camera of a lens and a [3, 4] world-to-camera pose."""
+    viewmat = torch.eye(4, dtype=torch.float32)
+    viewmat[:3] = torch.from_numpy(pose)
+    K = torch.tensor(lens.matrix, dtype=torch.float32)
+    return Camera(viewmat, K, lens.width, lens.height, distortion=lens.distortion)
