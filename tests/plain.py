@@ -18,7 +18,6 @@ model = partial(
         skip=4,
         sh_degree=1,
         appearance="color",
-        start="frames",
         dynamic_points=20_000,
         tracks=True,
     ),

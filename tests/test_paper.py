@@ -72,7 +72,6 @@ PAPER = {
         "schedule.reset_every": 3_000,
     },
     "3DGS: rasterization": {"max_alpha": 0.99, "background": "capture"},
-    "3DGS, Deformable-3DGS and the code of the authors: initial Gaussians": {"model.start": "plain"},
     "Deformable-3DGS: cameras and frames as they are, factor of HyperNeRF's vrig captures": {"distortion": False},
     "3DGS: depth regularization": {"loss.depth": 1.0, "loss.depth_end": 0.01},
     "code of the authors": {"model.dynamic_points": 100_000, "model.tracks": False},

@@ -27,7 +27,7 @@ NETWORK = plain.model(
     position_bands=1, time_bands=1, depth=1, width=2, max_static_points=20, dynamic_points=30
 )  # networks do not matter here
 CONFIG = plain.config(model=NETWORK)
-PLAIN = plain.config(model=dataclasses.replace(NETWORK, start="plain"))
+DEGREE = NETWORK.sh_degree
 DEPTH = 2.5
 BLOCK = (slice(10, 20), slice(15, 35))
 """The dynamic region: 200 pixels."""
@@ -97,18 +97,18 @@ def test_the_size_of_a_gaussian_is_the_root_mean_square_distance_to_three_neighb
     points = random_points(40)
     distances = (points[:, None].double() - points[None].double()).norm(dim=2).sort(1).values
     expected = (distances[:, 1:4] ** 2).mean(1).sqrt()
-    gaussians = gaussians_at(points, torch.rand(40, 3), NETWORK)
+    gaussians = gaussians_at(points, torch.rand(40, 3), DEGREE)
     assert error(gaussians.scales.detach(), expected[:, None].expand(40, 3)) < 1e-6
 
 
 def test_sizes_scale_with_the_points():
-    small, large = (gaussians_at(grid(spacing), torch.rand(27, 3), NETWORK).scales for spacing in (0.1, 10.0))
+    small, large = (gaussians_at(grid(spacing), torch.rand(27, 3), DEGREE).scales for spacing in (0.1, 10.0))
     assert error(large, 100 * small) < 1e-4
 
 
 def test_gaussians_start_at_their_points_with_an_opacity_of_a_tenth():
     points = random_points(20)
-    gaussians = gaussians_at(points, torch.rand(20, 3), NETWORK)
+    gaussians = gaussians_at(points, torch.rand(20, 3), DEGREE)
     assert torch.equal(gaussians.means, points)
     assert error(gaussians.opacities, torch.full((20,), 0.1)) < 1e-6
 
@@ -122,11 +122,10 @@ def merged(points, copies, jitter=0.0):
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-7])
 @pytest.mark.parametrize("copies", [2, 4, 30])
-@pytest.mark.parametrize("model", [NETWORK, PLAIN.model])
-def test_points_that_occur_several_times_have_the_size_of_single_ones(copies, jitter, model):
+def test_points_that_occur_several_times_have_the_size_of_single_ones(copies, jitter):
     points = 5.0 + random_points(50)
     repeated, original = merged(points, copies, jitter)
-    single, several = (gaussians_at(p, torch.rand(len(p), 3), model).scales.detach() for p in (points, repeated))
+    single, several = (gaussians_at(p, torch.rand(len(p), 3), DEGREE).scales.detach() for p in (points, repeated))
     assert error(several / single[original], torch.ones_like(several)) < 1e-4
 
 
@@ -135,8 +134,8 @@ def test_clusters_closer_than_cameras_resolve_have_the_size_of_single_points(spr
     points = 0.5 * random_points(200)
     repeated, original = merged(points, 6)
     repeated = repeated + spread * torch.randn(repeated.shape, generator=generator(1))
-    single = gaussians_at(points, torch.rand(200, 3), NETWORK).scales.detach()[original]
-    several = gaussians_at(repeated, torch.rand(1200, 3), NETWORK, resolution=0.02).scales.detach()
+    single = gaussians_at(points, torch.rand(200, 3), DEGREE).scales.detach()[original]
+    several = gaussians_at(repeated, torch.rand(1200, 3), DEGREE, resolution=0.02).scales.detach()
     assert several.min() >= 0.02
     assert (several / single).median().item() == pytest.approx(1.0, abs=0.15)
     assert (several / single).min() > 0.3
@@ -144,14 +143,7 @@ def test_clusters_closer_than_cameras_resolve_have_the_size_of_single_points(spr
 
 def test_the_resolution_changes_no_sizes_of_points_that_are_farther_apart():
     points, colors = grid(0.1), torch.rand(27, 3)
-    plain, resolved = (gaussians_at(points, colors, NETWORK, resolution=r).scales for r in (0.0, 0.02))
-    assert torch.equal(plain, resolved)
-
-
-def test_sizes_without_bounds_have_no_resolution():
-    points = random_points(40)
-    model = PLAIN.model
-    plain, resolved = (gaussians_at(points, torch.rand(40, 3), model, resolution=r).scales for r in (0.0, 1.0))
+    plain, resolved = (gaussians_at(points, colors, DEGREE, resolution=r).scales for r in (0.0, 0.02))
     assert torch.equal(plain, resolved)
 
 
@@ -179,21 +171,21 @@ def test_what_cameras_resolve_is_a_quarter_of_the_mean_side_of_a_pixel(monkeypat
 def test_a_place_that_holds_most_points_does_not_change_the_sizes_elsewhere():
     points = random_points(50)
     crowded = torch.cat([points, points[:1].expand(5_000, 3)])
-    alone, among = (gaussians_at(p, torch.rand(len(p), 3), NETWORK).scales.detach() for p in (points, crowded))
+    alone, among = (gaussians_at(p, torch.rand(len(p), 3), DEGREE).scales.detach() for p in (points, crowded))
     assert error(among[:50], alone) < 1e-6
     assert error(among[50:], alone[:1].expand(5_000, 3)) < 1e-6
 
 
 def test_few_points_have_half_of_the_maximum_size():
-    few = gaussians_at(torch.randn(3, 3), torch.zeros(3, 3), NETWORK, 8.0)
+    few = gaussians_at(torch.randn(3, 3), torch.zeros(3, 3), DEGREE, 8.0)
     assert few.scales.unique().tolist() == pytest.approx([4.0])
 
 
 @pytest.mark.parametrize("places", [1, 2, 3])
 def test_points_at_few_places_have_the_size_of_few_points(places):
     points = random_points(places)
-    gaussians = gaussians_at(merged(points, 9)[0], torch.rand(9 * places, 3), NETWORK)
-    assert torch.equal(gaussians.scales[0], gaussians_at(points, torch.rand(places, 3), NETWORK).scales[0])
+    gaussians = gaussians_at(merged(points, 9)[0], torch.rand(9 * places, 3), DEGREE)
+    assert torch.equal(gaussians.scales[0], gaussians_at(points, torch.rand(places, 3), DEGREE).scales[0])
 
 
 def test_close_points_are_distinct_down_to_rounding():
@@ -205,23 +197,12 @@ def test_close_points_are_distinct_down_to_rounding():
 
 def test_the_size_of_a_distant_point_is_limited():
     points = torch.cat([grid(0.1), torch.tensor([[1000.0, 0.0, 0.0]])])
-    assert gaussians_at(points, torch.rand(28, 3), NETWORK).scales.max() <= 10.0 * 0.1 * 1.001
-
-
-def test_sizes_without_bounds_are_those_of_3dgs():
-    """sqrt(clamp_min(mean squared distance to three neighbours, 1e-7)), of points at different places."""
-    points = torch.cat([grid(0.1), torch.tensor([[1000.0, 0.0, 0.0]]), 0.05 + 1e-5 * grid(1.0)[:4]])
-    squared = (points[:, None].double() - points[None].double()).square().sum(2).sort(1).values[:, 1:4].mean(1)
-    expected = squared.clamp_min(1e-7).sqrt()
-    assert expected.max() > 999
-    assert expected[-4:].tolist() == [1e-7**0.5] * 4
-    gaussians = gaussians_at(points, torch.rand(32, 3), PLAIN.model, max_scale=0.5)
-    assert (gaussians.scales.detach() / expected[:, None] - 1).abs().max() < 1e-5
+    assert gaussians_at(points, torch.rand(28, 3), DEGREE).scales.max() <= 10.0 * 0.1 * 1.001
 
 
 @pytest.mark.parametrize("num", range(5))
 def test_few_points_are_enough(num):
-    gaussians = gaussians_at(random_points(num), torch.rand(num, 3), NETWORK)
+    gaussians = gaussians_at(random_points(num), torch.rand(num, 3), DEGREE)
     assert len(gaussians) == num
     assert gaussians.log_scales.isfinite().all()
 
@@ -231,21 +212,6 @@ def test_initial_static_gaussians_have_the_colours_of_the_points():
     static = initial_scene(CONFIG, make_capture(points, colors)).static
     assert torch.equal(static.means, points)
     assert error(0.5 + 0.28209479 * static.sh_dc[:, 0].double(), colors.double() / 255.0) < 1e-6
-
-
-@pytest.mark.parametrize("has_colors", [False, True])
-@pytest.mark.parametrize("assumption", ["masks", "dynamic"])
-def test_initial_colours_can_be_those_of_deformable_3dgs(assumption, has_colors):
-    """SH2RGB(random / 255): 0.5 + SH_C0 · random / 255."""
-    points = random_points(9)
-    colors = torch.randint(0, 256, (9, 3), generator=generator(), dtype=torch.uint8) if has_colors else None
-    capture = make_capture(points, colors).assuming(assumption)
-    static = initial_scene(PLAIN, capture).static
-    gaussians = dynamic_gaussians(capture, ALIGNMENT, PLAIN) if assumption == "dynamic" else static
-    assert torch.equal(gaussians.means, points)
-    assert gaussians.sh_dc.min() >= -1e-7
-    assert 1 / 510 < gaussians.sh_dc.max() <= 1 / 255
-    assert len(gaussians.sh_dc.unique()) > 9
 
 
 def test_many_points_are_subsampled_at_random():
@@ -433,22 +399,6 @@ def test_without_depth_dynamic_gaussians_start_in_front_of_the_points_around_the
     assert error(depth, torch.full_like(depth, 2.0 * dynamic_points.DEPTH_FACTOR)) < 1e-4
 
 
-@pytest.mark.parametrize("inverse_depth", [None, mostly_unknown()])
-def test_without_depth_dynamic_gaussians_can_start_at_the_sparse_points(inverse_depth):
-    points = random_points(300)
-    config = dataclasses.replace(CONFIG, model=dataclasses.replace(NETWORK, start="plain"))
-    gaussians = dynamic_gaussians(make_capture(points, inverse_depth=inverse_depth), ALIGNMENT, config)
-    assert (gaussians.means[:, None] == points).all(2).any(1).all()
-    assert len(gaussians) == NETWORK.max_static_points < 300
-
-
-def test_with_depth_dynamic_gaussians_start_at_it_even_if_they_would_start_at_points_without():
-    config = dataclasses.replace(CONFIG, model=dataclasses.replace(NETWORK, start="plain"))
-    gaussians = dynamic_gaussians(make_capture(random_points(9), inverse_depth=constant_depth()), ALIGNMENT, config)
-    depth = CAMERA.project(gaussians.means.detach())[2]
-    assert error(depth, torch.full_like(depth, DEPTH)) < 5e-3
-
-
 def test_only_the_points_around_a_dynamic_pixel_count():
     around, corner = points_around_the_block(torch.full((8,), 3.0)), torch.zeros(1, dtype=torch.long)
     points = torch.cat([around, around, CAMERA.unproject(corner, corner, torch.ones(1))])
@@ -578,11 +528,10 @@ def test_if_masks_mark_nothing_as_dynamic_there_are_no_dynamic_gaussians():
     assert len(dynamic_gaussians(with_frames(capture, read), ALIGNMENT)) == 0
 
 
-@pytest.mark.parametrize(("config", "is_bounded"), [(CONFIG, True), (PLAIN, False)])
-def test_gaussians_of_unknown_depth_are_small_unless_sizes_are_unbounded(config, is_bounded):
+def test_gaussians_of_unknown_depth_are_small():
     capture = make_capture(100.0 * random_points(50))
-    max_scale = dynamic_gaussians(capture, ALIGNMENT, config).scales.max()
-    assert (max_scale < 1.0001 * dynamic_points.MAX_SCALE * capture.view_size) == is_bounded
+    max_scale = dynamic_gaussians(capture, ALIGNMENT).scales.max()
+    assert max_scale < 1.0001 * dynamic_points.MAX_SCALE * capture.view_size
 
 
 @pytest.mark.parametrize("deformation", ["mlp", "splines"])

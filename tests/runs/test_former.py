@@ -116,16 +116,6 @@ def test_the_rate_of_positions_had_a_factor_of_its_own(run, factor, means, unit)
     assert plan.length_unit(7.0) == 1.0
 
 
-@pytest.mark.parametrize(("before", "start"), [(None, "frames"), ("points", "frames"), ("uniform", "plain")])
-def test_where_dynamic_gaussians_start_was_an_option_of_its_own(run, before, start):
-    def change(values):
-        del values["model"]["start"]
-        values["model"] |= {} if before is None else {"dynamic_start": before}
-
-    edit(run, change)
-    assert read_config(run).model.start == start
-
-
 @pytest.mark.parametrize(
     ("before", "damage"),
     [
@@ -230,7 +220,7 @@ VERSION_0_3 = json.loads((Path(__file__).parent / "version_0_3.json").read_text(
 
 
 RESTATED = {
-    "paper": {"frozen": "all", "model.appearance": "all", "model.appearance_size": None, "model.start": "plain"},
+    "paper": {"frozen": "all", "model.appearance": "all", "model.appearance_size": None},
     "best": {"frozen": "nothing", "model.appearance_size": (4, 128)},
     "patient": {"frozen": "nothing", "model.appearance_size": None},
 }
@@ -253,7 +243,7 @@ def test_a_run_of_version_0_3_opens_with_its_values_and_can_be_resumed(tmp_path,
     before |= {name: value for name, value in written.items() if not isinstance(value, dict)}
     expected = {name: value for name, value in before.items() if name in found}
     expected |= {"out": tmp_path, "background": "black", "omit": (), "damage_masks": None, "densify.unit": "extent"}
-    expected |= {"model.appearance": "color", "model.start": "frames", "means_in_views": True} | RESTATED[preset]
+    expected |= {"model.appearance": "color", "means_in_views": True} | RESTATED[preset]
     assert {name: found[name] for name in expected} == expected
 
 

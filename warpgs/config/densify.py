@@ -30,8 +30,9 @@ class DensifyConfig:
     their second longest, or to 20 pixels (0.1 of the extent) if that is longer. 0: never."""
     max_gaussians: int = 3_000_000
     """Maximum number of Gaussians up to which both branches together grow."""
-    min_pixels: int = 24
-    """Minimum number of training pixels per Gaussian: densification stops where there are fewer. 0: no limit."""
+    min_pixels: int = 8
+    """Minimum number of training pixels per Gaussian: densification stops where there are fewer, and at three Gaussians
+    per pixel of an image. 0: no limit."""
     visibility: float = 3e-4
     """τ: static Gaussians with a lower visibility (paper Eq. 15) are removed."""
     reseed: Annotated[float, Bounds(max=1)] = 0.05

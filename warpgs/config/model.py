@@ -44,12 +44,6 @@ class ModelConfig:
     fit of the deformation to points is always in single precision."""
     max_static_points: int = 100_000
     """Maximum number of initial static Gaussians."""
-    start: Literal["frames", "plain"] = "frames"
-    """How Gaussians start. Frames: in the colours of the sparse points, or of the pixels that show them; with sizes,
-    which are distances to neighbours, between 1/1000 and 10 times their median; dynamic ones of unknown depth in front
-    of the points around them, under 1.9 % of the view size. Plain (paper, which names no start): mid-grey within
-    0.0011, as Deformable-3DGS on captures in the layouts of NeRF-DS and HyperNeRF; with any size, as in 3DGS; dynamic
-    ones of unknown depth at the sparse points, as in Deformable-3DGS."""
     dynamic_points: int = 20_000
     """Number of initial dynamic Gaussians."""
     dropout: Annotated[float, Bounds(max=0.9)] = 0.1

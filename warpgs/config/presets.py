@@ -27,7 +27,6 @@ PAPER = replace(
         appearance_size=None,
         skip=5,
         appearance="all",
-        start="plain",
         dynamic_points=100_000,
         dropout=0.0,
         tracks=False,
@@ -92,7 +91,7 @@ PATIENT = replace(
     ),
     loss=replace(BEST.loss, ssim=0.0, acceleration=0.02),
     optim=replace(BEST.optim, means=6.5e-4, sh_dc=1e-2, poses=0.0, networks=3e-3, networks_end=1e-4),
-    densify=replace(BEST.densify, gradient=2.5e-4, max_elongation=0.0, max_gaussians=20_000, min_pixels=8, weakest=0.0),
+    densify=replace(BEST.densify, gradient=2.5e-4, max_elongation=0.0, max_gaussians=20_000, weakest=0.0),
     schedule=replace(
         BEST.schedule,
         pretrain=300,

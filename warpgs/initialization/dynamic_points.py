@@ -123,7 +123,9 @@ def to_canonical(
 def gaussians_in_box(capture: Capture, count: int, config: TrainConfig, generator: torch.Generator) -> Gaussians:
     """Grey dynamic Gaussians at random in the box of the points, for a branch that nothing else can fill."""
     positions = random_points(capture.points, count, generator)
-    return gaussians_at(positions, torch.full_like(positions, 0.5), config.model, MAX_SCALE * capture.view_size)
+    return gaussians_at(
+        positions, torch.full_like(positions, 0.5), config.model.sh_degree, MAX_SCALE * capture.view_size
+    )
 
 
 @torch.no_grad()

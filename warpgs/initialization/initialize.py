@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from warpgs.config import TrainConfig
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.model.gaussians import SH_C0, Gaussians
+from warpgs.model.gaussians import Gaussians
 from warpgs.model.mlp_deformation import MlpDeformation
 from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
@@ -55,20 +55,18 @@ def _gaussians_at_points(config: TrainConfig, capture: Capture, views: Views, ge
     points, colors = _colored_points(config, capture, views, generator)
     focal = torch.stack([capture.cameras[name].focal for name in capture.train]).median()
     resolution = RESOLUTION * capture.median_depth / float(focal)
-    return gaussians_at(points, colors, config.model, resolution=resolution)
+    return gaussians_at(points, colors, config.model.sh_degree, resolution=resolution)
 
 
 def _colored_points(
     config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """A random subset of the capture's points with colours in [0, 1]; see ``model.start``."""
+    """A random subset of the capture's points, with their colours or those of the frames, in [0, 1]."""
     points, colors, max_count = capture.points, capture.point_colors, config.model.max_static_points
     if len(points) == 0:
         points, colors = random_points(points, max_count, generator), None
     chosen = subsample(points, max_count, generator)
     points = points[chosen]
-    if config.model.start == "plain":
-        return points, 0.5 + SH_C0 / 255.0 * torch.rand(points.shape, dtype=torch.float32, generator=generator)
     if colors is not None:
         return points, colors[chosen].float() / 255.0
     seen = []
@@ -110,11 +108,11 @@ def dynamic_gaussians(
 ) -> DynamicStart | None:
     """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation may be fitted first.
 
-    Without depth they start in front of the points around them, or, as ``model.start`` says, at the sparse points, as
-    if everything is assumed to be dynamic; without visible points at random positions in the scene's box. If nothing is
-    dynamic, there are none. What was tracked starts on its tracks. The deformation is fitted unless
-    ``schedule.fit_motion`` is 0, as in plans where it cannot be. The result is None, and the deformation as it was, if
-    ``is_stopped`` says during the fit that it is to stop.
+    Without depth they start in front of the points around them, without visible points at random positions in the
+    scene's box, and at the sparse points if everything is assumed to be dynamic. If nothing is dynamic, there are none.
+    What was tracked starts on its tracks. The deformation is fitted unless ``schedule.fit_motion`` is 0, as in plans
+    where it cannot be. The result is None, and the deformation as it was, if ``is_stopped`` says during the fit that it
+    is to stop.
     """
     if isinstance(deformation, SplineDeformation):
         tracks = find_tracks(capture, views)
@@ -125,8 +123,6 @@ def dynamic_gaussians(
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:
         return DynamicStart(Gaussians.empty(0, config.model.sh_degree))
-    if config.model.start == "plain" and not found.depth_known:
-        return DynamicStart(_gaussians_at_points(config, capture, views, generator))
     start: DynamicPoints | None = found
     if config.schedule.fit_motion and found.depth_known:
         times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
@@ -146,4 +142,4 @@ def _gaussians_at_dynamic_points(
     if len(found.positions) == 0:
         return gaussians_in_box(capture, max_count, config, generator)
     largest = math.inf if found.depth_known else MAX_SCALE * capture.view_size
-    return gaussians_at(found.positions, found.colors, config.model, largest)
+    return gaussians_at(found.positions, found.colors, config.model.sh_degree, largest)

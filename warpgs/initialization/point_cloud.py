@@ -9,14 +9,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from warpgs.cameras import Camera
-from warpgs.config import ModelConfig
 from warpgs.model.gaussians import Gaussians
 
 INITIAL_OPACITY = 0.1
 NUM_NEIGHBOURS = 3
-
-MIN_SCALE = 1e-7**0.5
-"""Minimum standard deviation where sizes are not bounded; as in 3DGS [scene units]."""
 
 FEW_POINTS_SCALE = 0.01
 """Standard deviation of Gaussians at so few points that their distances say nothing [scene units]; where there is a
@@ -39,7 +35,7 @@ BOX_MARGIN = 1.2
 def gaussians_at(
     points: Float[Tensor, "N 3"],
     colors: Float[Tensor, "N 3"],
-    model: ModelConfig,
+    sh_degree: int,
     max_scale: float = math.inf,
     resolution: float = 0.0,
 ) -> Gaussians:
@@ -50,26 +46,22 @@ def gaussians_at(
     Args:
         points: [N, 3] positions on the CPU.
         colors: [N, 3] in [0, 1].
-        model: Degree of spherical harmonics, and whether sizes are bounded (``start``).
-        max_scale: Maximum standard deviation, if sizes are bounded [scene units].
-        resolution: What cameras resolve, if sizes are bounded: closer points are at one place, and no Gaussian is
-            smaller [scene units].
+        sh_degree: Degree of spherical harmonics.
+        max_scale: Maximum standard deviation [scene units].
+        resolution: What cameras resolve: closer points are at one place, and no Gaussian is smaller [scene units].
     """
-    first, place = distinct(points, 0.0 if model.start == "plain" else resolution)
+    first, place = distinct(points, resolution)
     if len(first) <= NUM_NEIGHBOURS:
         scale = 0.5 * max_scale if math.isfinite(max_scale) else FEW_POINTS_SCALE
         scales = torch.full((points.shape[0],), scale, dtype=torch.float32)
-        return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, model.sh_degree)
+        return Gaussians.from_points(points, colors, scales, INITIAL_OPACITY, sh_degree)
     places = points[first].numpy()
     distances, _ = cKDTree(places).query(places, k=NUM_NEIGHBOURS + 1, workers=-1)
     scales = torch.from_numpy(np.sqrt((distances[:, 1:] ** 2).mean(1))).float()
-    if model.start != "plain":
-        # Of points that nearly coincide and of a few distant ones, distances are no sizes.
-        typical = scales.median().clamp_min(1e-7)
-        scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_min(resolution).clamp_max(max_scale)
-    else:
-        scales = scales.clamp_min(MIN_SCALE)
-    return Gaussians.from_points(points, colors, scales[place], INITIAL_OPACITY, model.sh_degree)
+    # Of points that nearly coincide and of a few distant ones, distances are no sizes.
+    typical = scales.median().clamp_min(1e-7)
+    scales = scales.clamp(1e-3 * typical, 10.0 * typical).clamp_min(resolution).clamp_max(max_scale)
+    return Gaussians.from_points(points, colors, scales[place], INITIAL_OPACITY, sh_degree)
 
 
 def distinct(points: Float[Tensor, "N 3"], resolution: float = 0.0) -> tuple[Int64[Tensor, " D"], Int64[Tensor, " N"]]:

@@ -61,7 +61,7 @@ def start_from_tracks(
     positions = torch.cat([points for points, _ in parts]) + starts[label]
     colors = torch.cat([colors for _, colors in parts])
     chosen = subsample(positions, config.model.dynamic_points, generator)
-    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model, MAX_SCALE * view_size)
+    gaussians = gaussians_at(positions[chosen], colors[chosen], config.model.sh_degree, MAX_SCALE * view_size)
     deformation.resize(len(tracks), len(tracks[0].path.c))
     deformation.homes.copy_(starts)
     ranks.copy_first_(deformation.homes)

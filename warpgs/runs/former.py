@@ -80,11 +80,12 @@ REMOVED: dict[str, Removed] = {
     "model.appearance_depth": Removed("--model.appearance-size is for that"),
     "model.appearance_opacity": Removed("--model.appearance is for that"),
     "model.appearance_width": Removed("--model.appearance-size is for that"),
-    "model.bound_sizes": Removed("--model.start is for that"),
-    "model.dynamic_start": Removed("--model.start is for that"),
+    "model.bound_sizes": Removed(),
+    "model.dynamic_start": Removed(),
     "model.path_points": Removed(),
     "model.paths": Removed(),
-    "model.point_colors": Removed("--model.start is for that"),
+    "model.point_colors": Removed(),
+    "model.start": Removed(),
     "optim.means_scale": Removed("--optim.means is in view sizes, with --densify.unit extent in scene units"),
     "optim.opacities": _always(0.05),
     "optim.quats": _always(1e-3),
@@ -264,17 +265,11 @@ def _means(values: dict[str, Any]) -> None:
             optim["means"] = means * factor
 
 
-def _start(values: dict[str, Any]) -> None:
-    """Colours, sizes and places at which Gaussians start were options of their own, of which paper 0.3 had the last."""
-    if isinstance(model := values.get("model"), dict):
-        model.setdefault("start", "plain" if model.get("dynamic_start") == "uniform" else "frames")
-
-
 def _masks(values: dict[str, Any]) -> None:
     """Damage to masks was a section of three numbers."""
     if isinstance(masks := values.get("masks"), dict):
         values.setdefault("damage_masks", ",".join(f"{kind}:{size}" for kind, size in masks.items() if size) or None)
 
 
-CHANGES = (_looked_up, _losses, _switches, _factor, _appearance, _means, _start, _masks)
+CHANGES = (_looked_up, _losses, _switches, _factor, _appearance, _means, _masks)
 """What was written otherwise; each changes the values in place."""

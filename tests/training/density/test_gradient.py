@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import pytest
 import torch
@@ -14,6 +14,7 @@ from tests.training.density.sets import copies, equal, make_gaussians, make_scen
 from warpgs.model.gaussians import PARAMETERS, Gaussians
 from warpgs.runs.logger import TrainingLogger
 from warpgs.training.density.gradient import GradientStrategy, Limits, densify
+from warpgs.views.views import Views
 
 UNIT = 10.0
 CONFIG = plain.densify(gradient=0.5, unit="extent")
@@ -229,6 +230,17 @@ def test_a_capture_has_no_more_gaussians_than_its_training_pixels_allow(data, tm
     schedule = dataclasses.replace(tiny.SCHEDULE, densify_until=10, prune_every=100, reset_every=100)
     scene = trained(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config, schedule=schedule))
     assert most - 10 < len(scene.static) + len(scene.dynamic) <= most
+
+
+@pytest.mark.parametrize(("num_views", "most"), [(6, 576), (23, 2208), (24, 2304), (60, 2304)])
+def test_many_frames_allow_no_more_gaussians_than_three_per_pixel_of_an_image(data, tmp_path, num_views, most):
+    densify_config = dataclasses.replace(tiny.CONFIG.densify, min_pixels=8, max_gaussians=9_999)
+    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, densify=densify_config))
+    views = MagicMock(spec=Views, num_pixels=num_views * 32 * 24)
+    views.__len__.return_value = num_views
+    change = trainer._adaptation(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+    capacity = dataclasses.replace(change, views=views).capacity
+    assert capacity + len(trainer.scene.static) + len(trainer.scene.dynamic) == most
 
 
 @pytest.mark.parametrize(("done", "removed"), [(tiny.SCHEDULE.reset_every, 0), (tiny.SCHEDULE.reset_every + 1, 1)])

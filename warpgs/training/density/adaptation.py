@@ -14,6 +14,10 @@ from warpgs.ops.adam import Adam
 from warpgs.training.schedule import IterationPlan
 from warpgs.views.views import Views
 
+MAX_PER_PIXEL = 3
+"""Maximum number of Gaussians per pixel of an image: more frames show little more of a scene, but without a limit clips
+of 80 frames grow until memory ends."""
+
 
 @dataclass(frozen=True)
 class Adaptation:
@@ -46,5 +50,6 @@ class Adaptation:
         """Number of Gaussians that may be added to both branches together; negative if there are too many."""
         config, most = self.config.densify, self.config.densify.max_gaussians
         if config.min_pixels:
-            most = min(most, self.views.num_pixels // config.min_pixels)
+            pixels = self.views.num_pixels
+            most = min(most, pixels // config.min_pixels, MAX_PER_PIXEL * pixels // len(self.views))
         return most - len(self.scene.static) - len(self.scene.dynamic)

@@ -117,7 +117,7 @@ def gaussians_that_show(
         seen, time = found.positions[chosen].to(views.device), views[index].time
         x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * view_size)
         canonical[chosen], kept[chosen] = x.cpu(), reached.cpu()
-    return gaussians_at(canonical[kept], found.colors[kept], config.model, MAX_SCALE * view_size)
+    return gaussians_at(canonical[kept], found.colors[kept], config.model.sh_degree, MAX_SCALE * view_size)
 
 
 def reseed(at: Adaptation) -> None:
