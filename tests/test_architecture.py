@@ -20,7 +20,7 @@ ORDER = [
     "model",
     "rendering",
     "visualize",
-    "data",
+    "data formats",
     "download",
     "views",
     "synthetic",

@@ -10,7 +10,7 @@ from tests.export.scenes import refusal
 from warpgs.cli import main
 from warpgs.editing.edits_file import MAX_BYTES, NAME, NONE, edits_in_use, read_edits, save_edits
 from warpgs.editing.options import Editing, Edits
-from warpgs.export.standard import read_standard
+from warpgs.formats.standard import read_standard
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
 from warpgs.viewer.source import open_source

@@ -5,8 +5,8 @@ import torch
 from tests import plain, tiny
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
-from warpgs.export.cloud import Cloud
 from warpgs.export.clouds import Clouds
+from warpgs.formats.cloud import Cloud
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats

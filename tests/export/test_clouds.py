@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from tests.export import scenes
-from warpgs.export.cloud import Cloud
 from warpgs.export.clouds import Clouds
+from warpgs.formats.cloud import Cloud
 from warpgs.model.splats import Splats
 from warpgs.runs.trained import TrainedScene
 

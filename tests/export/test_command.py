@@ -18,13 +18,13 @@ from warpgs.data.capture import Capture
 from warpgs.editing.options import Editing, Edits
 from warpgs.export import orientation, page
 from warpgs.export.clouds import Clouds
-from warpgs.export.compressed import read_compressed
 from warpgs.export.export_run import export_run
 from warpgs.export.job import Writer
 from warpgs.export.options import Export
-from warpgs.export.standard import read_standard
 from warpgs.export.start_camera import start_view
 from warpgs.export.writers import WRITERS
+from warpgs.formats.compressed import read_compressed
+from warpgs.formats.standard import read_standard
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run

@@ -7,8 +7,8 @@ import pytest
 
 from tests.export import scenes
 from warpgs.data.ply import read_ply
-from warpgs.export.compressed import read_compressed, write_compressed
-from warpgs.export.ply import write_ply
+from warpgs.formats.compressed import read_compressed, write_compressed
+from warpgs.formats.ply import write_ply
 from warpgs.model.gaussians import SH_C0
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.export import scenes
-from warpgs.export.cloud import Cloud, logit
-from warpgs.export.gltf import EXTENSION, write_glb
+from warpgs.formats.cloud import Cloud, logit
+from warpgs.formats.gltf import EXTENSION, write_glb
 
 TYPES = {5126: "<f4", 5121: "u1"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}

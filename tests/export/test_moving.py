@@ -7,10 +7,11 @@ import pytest
 
 from tests.export import scenes
 from warpgs.export import fourdgs, usd
-from warpgs.export.cloud import Cloud, logit
 from warpgs.export.job import Job
 from warpgs.export.options import Export
-from warpgs.export.orientation import AXES, rotated, upright
+from warpgs.export.orientation import AXES, upright
+from warpgs.formats.cloud import Cloud, logit
+from warpgs.formats.rotation import rotated
 from warpgs.model.gaussians import SH_C0
 from warpgs.runs.run import Run
 

@@ -11,6 +11,7 @@ from tests.export import scenes
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.export import orientation
+from warpgs.formats.rotation import rotated
 
 ROTATIONS = {
     "any": Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(),
@@ -26,7 +27,7 @@ def test_rotated_cameras_see_the_same_image_of_a_rotated_cloud(rotation, degree)
     cloud, camera = scenes.cloud(60, degree), scenes.camera()
     viewmat = camera.viewmat.clone()
     viewmat[:3, :3] = viewmat[:3, :3] @ torch.from_numpy(rotation.T).float()
-    image = scenes.image(orientation.rotated(cloud, rotation), dataclasses.replace(camera, viewmat=viewmat))
+    image = scenes.image(rotated(cloud, rotation), dataclasses.replace(camera, viewmat=viewmat))
     assert (image - scenes.image(cloud, camera)).abs().max() < 1e-5
 
 

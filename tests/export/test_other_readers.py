@@ -16,12 +16,13 @@ import torch
 from tests.export import node, scenes
 from warpgs.data.ply import read_ply
 from warpgs.export import orientation
-from warpgs.export.cloud import Cloud, logit, sigmoid
-from warpgs.export.compressed import write_compressed
-from warpgs.export.gltf import write_glb
-from warpgs.export.sog import write_sog
-from warpgs.export.spz import write_spz, write_spz_gzip
-from warpgs.export.standard import read_standard, write_standard
+from warpgs.formats.cloud import Cloud, logit, sigmoid
+from warpgs.formats.compressed import write_compressed
+from warpgs.formats.gltf import write_glb
+from warpgs.formats.rotation import rotated
+from warpgs.formats.sog import write_sog
+from warpgs.formats.spz import write_spz, write_spz_gzip
+from warpgs.formats.standard import read_standard, write_standard
 from warpgs.model.gaussians import SH_C0
 from warpgs.video.camera_paths import UP
 
@@ -46,7 +47,7 @@ def test_splat_transform_reads_the_scene(tmp_path, name, degree):
     cloud, (write, y_up) = scenes.cloud(300, degree), FILES[name]
     version = subprocess.run([str(SPLAT_TRANSFORM), "--version"], capture_output=True, text=True, check=True)
     y_up = y_up and " v2." in version.stdout + version.stderr
-    write(tmp_path / name, orientation.rotated(cloud, orientation.upright(UP, y_up)))
+    write(tmp_path / name, rotated(cloud, orientation.upright(UP, y_up)))
     command = [str(SPLAT_TRANSFORM), str(tmp_path / name), str(tmp_path / "back.ply")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.export.pages import from_planes
-from warpgs.export import packing
+from warpgs.formats import packing
 
 RANDOM = np.random.default_rng(0)
 

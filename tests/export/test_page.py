@@ -14,10 +14,10 @@ from tests.export.pages import read_page
 from warpgs.editing.contribution import contribution
 from warpgs.export import page
 from warpgs.export.baking import PARTS, STEPS, TEXEL, bake, nearest_to_identity, octaves_of, texture_bytes
-from warpgs.export.cloud import sigmoid
-from warpgs.export.compressed import morton_order
 from warpgs.export.page import write_page
 from warpgs.export.start_camera import StartView
+from warpgs.formats.cloud import sigmoid
+from warpgs.formats.compressed import morton_order
 from warpgs.model.gaussians import SH_C0
 from warpgs.video.camera_paths import evenly_spaced
 from warpgs.video.filmed import DRAG_LIMIT, Filmed

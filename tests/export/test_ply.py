@@ -7,7 +7,7 @@ import pytest
 
 from tests.export import scenes
 from warpgs.data.ply import read_ply
-from warpgs.export import compressed, ply, standard
+from warpgs.formats import compressed, ply, standard
 
 TABLE = np.array([(1.5, 7, 255), (-2.0, 8, 0)], [("x", "<f4"), ("word", "<u4"), ("byte", "u1")])
 READERS = [read_ply, standard.read_standard, compressed.read_compressed]

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from tests.export import scenes
-from warpgs.export import sog
-from warpgs.export.cloud import Cloud, logit
-from warpgs.export.sog import fit_table, write_sog
+from warpgs.formats import sog
+from warpgs.formats.cloud import Cloud, logit
+from warpgs.formats.sog import fit_table, write_sog
 
 
 def parts(path):

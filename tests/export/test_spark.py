@@ -15,10 +15,11 @@ import pytest
 from tests.export import node, scenes
 from tests.export.browser import Browser, executable
 from warpgs.export import orientation
-from warpgs.export.compressed import write_compressed
-from warpgs.export.sog import write_sog
-from warpgs.export.spz import write_spz_gzip
-from warpgs.export.standard import write_standard
+from warpgs.formats.compressed import write_compressed
+from warpgs.formats.rotation import rotated
+from warpgs.formats.sog import write_sog
+from warpgs.formats.spz import write_spz_gzip
+from warpgs.formats.standard import write_standard
 from warpgs.video.camera_paths import UP
 
 pytestmark = [
@@ -119,7 +120,7 @@ def test_spark_renders_the_scene(browser, site, name, degree, antialias):
     (folder, address), (write, y_up) = site, FILES[name]
     cloud = scenes.cloud(300, degree).replaced(antialias=antialias)
     file = f"degree-{degree}-{name}"  # its own: the browser caches by name and second
-    write(folder / file, orientation.rotated(cloud, orientation.upright(UP, y_up)))
+    write(folder / file, rotated(cloud, orientation.upright(UP, y_up)))
     image, count = rendered(browser, address, file=file, yUp=y_up, spark=BLUR[antialias])
     truth = scenes.image(cloud, scenes.camera(*SIZE)).numpy()
     assert count == 300

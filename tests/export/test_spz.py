@@ -10,8 +10,8 @@ import pytest
 
 from tests.export import scenes
 from warpgs.cli import main
-from warpgs.export.cloud import Cloud, logit
-from warpgs.export.spz import write_spz, write_spz_gzip
+from warpgs.formats.cloud import Cloud, logit
+from warpgs.formats.spz import write_spz, write_spz_gzip
 
 WIDTHS = (9, 1, 3, 3, 4)
 """Bytes per Gaussian of positions, opacities, colours, scales and rotations."""

@@ -8,9 +8,9 @@ import pytest
 
 from tests.export import scenes
 from warpgs.data.ply import read_ply
-from warpgs.export.compressed import write_compressed
-from warpgs.export.ply import write_ply
-from warpgs.export.standard import columns, read_standard, write_standard
+from warpgs.formats.compressed import write_compressed
+from warpgs.formats.ply import write_ply
+from warpgs.formats.standard import columns, read_standard, write_standard
 
 COLUMNS = columns(15)
 

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32
 from scipy.spatial.transform import Rotation
 
+from warpgs.formats.cloud import ARRAYS, Cloud, logit, sigmoid
+from warpgs.formats.compressed import morton_order
 from warpgs.model.gaussians import SH_C0
 
-from .cloud import ARRAYS, Cloud, logit, sigmoid
-from .compressed import morton_order
 from .transform import Levels
 
 STEPS = {

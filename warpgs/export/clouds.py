@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
+from warpgs.formats.cloud import Cloud
 from warpgs.runs.trained import TrainedScene
-
-from .cloud import Cloud
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ holds colours of degree 0, the mean over all directions. Axes are x right, y up,
 import numpy as np
 
 from warpgs.files import write_bytes
+from warpgs.formats.cloud import Cloud, sigmoid
+from warpgs.formats.packages import required
 from warpgs.model.gaussians import SH_C0
 
-from .cloud import Cloud, sigmoid
 from .job import Job, Writer
-from .moving import KEYS, OPTIONS, SECONDS, clouds_over_time, required
+from .moving import KEYS, OPTIONS, SECONDS, clouds_over_time
 
 PERSISTENCE = 1000.0
 """Standard deviation of a Gaussian's visibility over time, in durations: it does not fade."""

@@ -1,19 +1,15 @@
 """Formats whose file holds the moving scene: the clouds at its key times, and the packages that write it."""
 
-import importlib
 from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
 from warpgs.command_line.progress import progress
-from warpgs.command_line.version import install_command
+from warpgs.formats.cloud import Cloud
+from warpgs.formats.rotation import rotated
 from warpgs.video.camera_paths import evenly_spaced
 
-from .cloud import Cloud
 from .job import Job
-from .orientation import rotated
 
 KEYS = 30
 """Default number of key times."""
@@ -34,15 +30,3 @@ def clouds_over_time(job: Job, count: int) -> Iterator[Cloud]:
     rotation = job.rotation(y_up=True)
     for time in progress(times, "exporting", job.options.quiet):
         yield rotated(job.clouds.at(time).select(finite), rotation)
-
-
-def required(path: Path, module: str, package: str) -> ModuleType:
-    """A module of an optional package that writes a file.
-
-    Raises:
-        OSError: If the package is not installed; the message names it.
-    """
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise OSError(f"{path} needs {package}: {install_command('export')}") from error

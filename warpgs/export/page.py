@@ -22,13 +22,13 @@ from jaxtyping import Int32
 from warpgs.command_line.progress import progress
 from warpgs.editing.contribution import contribution, sample_cameras
 from warpgs.files import write_bytes
+from warpgs.formats.packing import to_planes
 from warpgs.video.camera_paths import evenly_spaced
 from warpgs.video.filmed import DRAG_LIMIT, REACH, Filmed
 
 from .baking import PARTS, Baked, Branch, bake, texture_bytes
 from .job import Job, Writer
 from .moving import KEYS, SECONDS
-from .packing import to_planes
 from .start_camera import StartView, start_view
 from .transform import Levels
 

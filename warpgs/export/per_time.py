@@ -6,11 +6,11 @@ from pathlib import Path
 
 from warpgs.command_line.progress import progress
 from warpgs.files import remove_numbered
+from warpgs.formats.cloud import Cloud
+from warpgs.formats.rotation import rotated
 from warpgs.video.camera_paths import evenly_spaced
 
-from .cloud import Cloud
 from .job import Job, Writer
-from .orientation import rotated
 
 OPTIONS = ("time", "frames", "layers", "up")
 

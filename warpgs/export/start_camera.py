@@ -9,10 +9,10 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.config import Color
 from warpgs.data.capture import COLORS, Capture, background_color
+from warpgs.formats.cloud import Cloud
 from warpgs.video import camera_paths
 from warpgs.video.filmed import Filmed
 
-from .cloud import Cloud
 from .clouds import Clouds
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from warpgs.cameras import Camera
 from warpgs.data.lens import Lens
 from warpgs.files import write_json
+from warpgs.formats.ply import write_ply
 
 from .camera_set import CameraSet, held_lens
-from .ply import write_ply
 
 
 def write_nerfstudio(folder: Path, cameras: CameraSet) -> None:

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from warpgs.files import atomic_path
+from warpgs.formats.cloud import Cloud, sigmoid
+from warpgs.formats.packages import required
 from warpgs.ops.sh import degree_of
 
-from .cloud import Cloud, sigmoid
 from .job import Job, Writer
-from .moving import KEYS, OPTIONS, SECONDS, clouds_over_time, required
+from .moving import KEYS, OPTIONS, SECONDS, clouds_over_time
 
 BRANCHES = ("static", "dynamic")
 PARTS = ("extent", "positions", "orientations", "scales", "opacities", "coefficients")

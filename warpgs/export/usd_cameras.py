@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warpgs.cameras import Camera
+from warpgs.formats.packages import required
 
 from .camera_set import CameraSet
-from .moving import required
 from .usd import save_stage
 
 FOCAL_LENGTH = 50.0

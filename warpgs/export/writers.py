@@ -1,23 +1,24 @@
 """The export formats of ``warpgs export --format``."""
 
-from .compressed import write_compressed
+from warpgs.formats.compressed import write_compressed
+from warpgs.formats.gltf import write_glb
+from warpgs.formats.sog import write_sog
+from warpgs.formats.spz import write_spz, write_spz_gzip
+from warpgs.formats.standard import write_standard
+
 from .fourdgs import FOURDGS
-from .gltf import GLB
 from .job import Writer
 from .page import PAGE
 from .per_time import per_time
-from .sog import SOG
-from .spz import SPZ, SPZ_GZIP
-from .standard import write_standard
 from .usd import USD
 
 WRITERS: dict[str, Writer] = {
     "ply": per_time(".ply", write_standard),
     "compressed": per_time(".compressed.ply", write_compressed),
-    "sog": SOG,
-    "spz": SPZ,
-    "spz3": SPZ_GZIP,
-    "glb": GLB,
+    "sog": per_time(".sog", write_sog),
+    "spz": per_time(".spz", write_spz, y_up=True),
+    "spz3": per_time(".v3.spz", write_spz_gzip, y_up=True),
+    "glb": per_time(".glb", write_glb, y_up=True),
     "usd": USD,
     "4dgs": FOURDGS,
     "html": PAGE,

@@ -26,7 +26,6 @@ from warpgs.ops.sh import degree_of
 from .cloud import Cloud, sigmoid
 from .compressed import morton_order
 from .packing import without_max_component
-from .per_time import per_time
 
 TABLE = 256
 """Number of values in a table."""
@@ -165,6 +164,3 @@ def _zip(meta: dict[str, Any], images: dict[str, np.ndarray]) -> bytes:
 def _entry(name: str) -> zipfile.ZipInfo:
     """An entry without the time of its writing, so that equal scenes give equal files."""
     return zipfile.ZipInfo(name)
-
-
-SOG = per_time(".sog", write_sog)

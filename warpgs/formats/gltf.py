@@ -19,7 +19,6 @@ from warpgs.model.gaussians import SH_C0
 from warpgs.ops.sh import degree_of, num_bases
 
 from .cloud import Cloud, sigmoid
-from .per_time import per_time
 
 EXTENSION = "KHR_gaussian_splatting"
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
@@ -107,6 +106,3 @@ def _document(arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
     }
-
-
-GLB = per_time(".glb", write_glb, y_up=True)

@@ -19,9 +19,8 @@ from warpgs.files import write_bytes
 from warpgs.ops.sh import degree_of
 
 from .cloud import Cloud, sigmoid
-from .moving import required
+from .packages import required
 from .packing import without_max_component
-from .per_time import per_time
 
 MAGIC = 0x5053474E
 VERSION, GZIP_VERSION = 4, 3
@@ -110,7 +109,3 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
     for k in range(3):
         words = words << np.uint32(10) | (others[:, k] < 0).astype(np.uint32) << np.uint32(9) | size[:, k]
     return words
-
-
-SPZ = per_time(".spz", write_spz, y_up=True)
-SPZ_GZIP = per_time(".v3.spz", write_spz_gzip, y_up=True)

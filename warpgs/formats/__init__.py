@@ -1,0 +1,1 @@
+"""Files of Gaussians, as other programs write and read them."""
