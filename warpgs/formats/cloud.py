@@ -108,5 +108,11 @@ def logit(opacities: np.ndarray) -> np.ndarray:
     return np.log(opacities / (1 - opacities))
 
 
+def unit_quats(quats: np.ndarray) -> np.ndarray:
+    """Normalised quaternions; a zero quaternion, which is not a rotation, becomes NaN."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+
+
 def _to_numpy(tensor: Tensor) -> np.ndarray:
     return tensor.detach().float().cpu().contiguous().numpy()

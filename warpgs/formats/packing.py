@@ -59,10 +59,7 @@ def unpack_rotations(words: UInt32[np.ndarray, " N"]) -> Float32[np.ndarray, "N 
     """The unit quaternions that ``pack_rotations`` packed, up to their sign."""
     fields = unpack(words, (2, *[ROTATION_BITS] * 3))
     largest = fields[:, 0].astype(np.int64)
-    others = dequantise(fields[:, 1:], COMPONENT_RANGE, ROTATION_BITS)
-    quats = np.empty((len(words), 4))
-    quats[_smaller(largest)] = others.reshape(-1)
-    quats[np.arange(len(words)), largest] = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(1)))
+    quats = with_max_component(largest, dequantise(fields[:, 1:], COMPONENT_RANGE, ROTATION_BITS))
     return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
 
 
@@ -73,6 +70,16 @@ def without_max_component(
     largest = np.abs(quats).argmax(1)
     positive = quats * np.where(quats[np.arange(len(quats)), largest] < 0, -1.0, 1.0)[:, None]
     return largest, positive[_smaller(largest)].reshape(-1, 3)
+
+
+def with_max_component(
+    largest: Int64[np.ndarray, " N"], others: Float64[np.ndarray, "N 3"]
+) -> Float64[np.ndarray, "N 4"]:
+    """The quaternions of ``without_max_component``; longer than 1 if the others are."""
+    quats = np.empty((len(largest), 4))
+    quats[_smaller(largest)] = others.reshape(-1)
+    quats[np.arange(len(largest)), largest] = np.sqrt(np.maximum(0.0, 1.0 - (others**2).sum(1)))
+    return quats
 
 
 def _smaller(largest: np.ndarray) -> np.ndarray:

@@ -10,17 +10,19 @@ Axes are x right, y up, z towards the viewer.
 
 import gzip
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8, UInt32
 
-from warpgs.files import write_bytes
-from warpgs.ops.sh import degree_of
+from warpgs.files import read_start, require_file, write_bytes
+from warpgs.ops.sh import MAX_DEGREE, degree_of, num_bases
 
-from .cloud import Cloud, sigmoid
+from .bounds import MAX_BYTES, require_plausible
+from .cloud import Cloud, logit, sigmoid, unit_quats
 from .packages import required
-from .packing import without_max_component
+from .packing import unpack, with_max_component, without_max_component
 
 MAGIC = 0x5053474E
 VERSION, GZIP_VERSION = 4, 3
@@ -35,6 +37,10 @@ MAX_FRACTION = 20
 """Maximum number of fractional bits of a position."""
 
 COLOR_SCALE = 0.15
+GZIP = b"\x1f\x8b"
+MAX_SPZ_DEGREE, MAX_BITS = 4, 24
+"""Maximum degree of spherical harmonics, and number of fractional bits, of a file."""
+
 LEVEL = 12
 """Compression level of Zstandard, that of the reference implementation."""
 
@@ -109,3 +115,105 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
     for k in range(3):
         words = words << np.uint32(10) | (others[:, k] < 0).astype(np.uint32) << np.uint32(9) | size[:, k]
     return words
+
+
+def read_spz(path: Path) -> Cloud:
+    """Reads SPZ of versions 1 to 4; coefficients of degree 4, which only SPZ has, are dropped.
+
+    Raises:
+        ValueError: If it is another file, damaged, or too large for its size; the message names it.
+        OSError: If it is of version 4 and zstandard is not installed.
+    """
+    size = require_file(path, MAX_BYTES)
+    data = read_start(path, size)
+    if len(data) < HEADER.size:
+        raise ValueError(f"{path} is not an SPZ file: it has {len(data)} bytes")
+    is_zipped = data[:2] == GZIP
+    magic, version, count, degree, bits, flags, streams = HEADER.unpack(
+        _inflated(path, data, HEADER.size) if is_zipped else data[: HEADER.size]
+    )
+    if magic != MAGIC or version not in ((1, 2, 3) if is_zipped else (VERSION,)):
+        raise ValueError(f"{path} is not an SPZ file of version 1 to 4")
+    if degree > MAX_SPZ_DEGREE or bits > MAX_BITS:
+        raise ValueError(f"{path} is damaged: degree {degree}, {bits} fractional bits")
+    widths = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
+    sizes = [width * count for width in widths]
+    require_plausible(path, sum(sizes), size)
+    if is_zipped:
+        content = _inflated(path, data, HEADER.size + sum(sizes))[HEADER.size :]
+        ends = np.cumsum(sizes)
+        parts = [content[end - size : end] for end, size in zip(ends, sizes, strict=True)]
+    else:
+        parts = _decompressed(path, data, streams, sizes)
+    return _cloud(version, bits, bool(flags & ANTIALIAS), [np.frombuffer(part, np.uint8) for part in parts])
+
+
+def _inflated(path: Path, data: bytes, size: int) -> bytes:
+    """The first bytes of what gzip has compressed."""
+    try:
+        content = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(data, size)
+    except zlib.error as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if len(content) < size:
+        raise ValueError(f"{path} is truncated: its header claims {size:,} bytes, it has {len(content):,}")
+    return content
+
+
+def _decompressed(path: Path, data: bytes, count: int, sizes: list[int]) -> list[bytes]:
+    """The streams of a file of version 4, of given sizes, empty ones of which are omitted."""
+    zstandard = required(path, "zstandard", "zstandard")
+    expected = [size for size in sizes if size]
+    parts: list[bytes] = []
+    try:
+        (start,) = struct.unpack_from("<I", data, HEADER.size)
+        contents = [struct.unpack_from("<QQ", data, start + 16 * k) for k in range(count)]
+        offset = start + 16 * count
+        if [size for _, size in contents] not in (expected, sizes):
+            raise ValueError(f"its streams have {[size for _, size in contents]} bytes, expected {expected}")
+        for length, size in contents:
+            stream = zstandard.ZstdDecompressor().stream_reader(data[offset : offset + length])
+            part = stream.read(size)
+            if len(part) < size or offset + length > len(data):
+                raise ValueError("a stream is truncated")
+            parts, offset = [*parts, part], offset + length
+    except (struct.error, ValueError, OverflowError, zstandard.ZstdError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    missing = iter([part for part in parts if part])
+    return [next(missing) if size else b"" for size in sizes]
+
+
+def _cloud(version: int, bits: int, antialias: bool, parts: list[UInt8[np.ndarray, "..."]]) -> Cloud:
+    """The cloud of the streams of a file."""
+    positions, opacities, colors, scales, rotations, rest = parts
+    N = len(opacities)
+    if version == 1:
+        means = positions.view("<f2").reshape(N, 3).astype(np.float32)
+    else:
+        low, middle, high = np.moveaxis(positions.reshape(N, 3, 3).astype(np.int32), 2, 0)
+        fixed = low | middle << 8 | high << 16
+        means = ((fixed ^ 0x800000) - 0x800000) / np.float32(1 << bits)
+    constant = (colors.reshape(N, 1, 3) / 255 - 0.5) / COLOR_SCALE
+    others = (rest.reshape(N, -1, 3) / 128 - 1)[:, : num_bases(MAX_DEGREE) - 1] if len(rest) else np.zeros((N, 0, 3))
+    return Cloud(
+        means=means.astype(np.float32),
+        quats=_first_three(rotations.reshape(N, 3)) if version < 3 else _smallest_three(rotations.view("<u4")),
+        log_scales=(scales.reshape(N, 3) / 16 - 10).astype(np.float32),
+        logit_opacities=logit(opacities / 255).astype(np.float32),
+        sh=np.concatenate([constant, others], 1).astype(np.float32),
+        is_dynamic=np.zeros(N, bool),
+        antialias=antialias,
+    )
+
+
+def _first_three(values: UInt8[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 4"]:
+    """Quaternions of versions 1 and 2: x, y, z, and w ≥ 0."""
+    others = values / 127.5 - 1
+    w = np.sqrt(np.maximum(0.0, 1 - (others**2).sum(1, keepdims=True)))
+    return unit_quats(np.concatenate([w, others], 1))
+
+
+def _smallest_three(words: UInt32[np.ndarray, " N"]) -> Float32[np.ndarray, "N 4"]:
+    """Quaternions of versions 3 and 4: the inverse of ``_rotations``."""
+    fields = unpack(words, (2, 1, 9, 1, 9, 1, 9)).astype(np.int64)
+    others = np.where(fields[:, 1::2] == 1, -1, 1) * fields[:, 2::2] / (511 * np.sqrt(2))
+    return unit_quats(np.roll(with_max_component(fields[:, 0], others), 1, axis=1))

@@ -13,7 +13,7 @@ import numpy as np
 from warpgs.data.ply import read_ply
 from warpgs.ops.sh import MAX_DEGREE, num_bases
 
-from .cloud import Cloud
+from .cloud import Cloud, unit_quats
 from .ply import column, write_ply
 
 REST_COUNTS = tuple(num_bases(degree) - 1 for degree in range(MAX_DEGREE + 1))
@@ -61,11 +61,19 @@ def read_standard(path: Path) -> Cloud:
     Raises:
         ValueError: If it is another file, damaged, or has values that are not finite; the message names it.
     """
+    cloud = parse_standard(path)
+    if not cloud.finite.all():
+        raise ValueError(f"{path} has {np.count_nonzero(~cloud.finite):,} Gaussians with values that are not finite")
+    return cloud
+
+
+def parse_standard(path: Path) -> Cloud:
+    """As ``read_standard``, but also with values that are not finite."""
     tables = read_ply(path)
     if "vertex" not in tables:
         raise ValueError(f"{path} has no element vertex")
     vertex = tables["vertex"]
-    cloud = Cloud(
+    return Cloud(
         means=_block(path, vertex, ["x", "y", "z"]),
         quats=unit_quats(_block(path, vertex, [f"rot_{k}" for k in range(4)])),
         log_scales=_block(path, vertex, [f"scale_{k}" for k in range(3)]),
@@ -73,15 +81,6 @@ def read_standard(path: Path) -> Cloud:
         sh=_coefficients(path, vertex),
         is_dynamic=np.zeros(len(vertex), bool),
     )
-    if not cloud.finite.all():
-        raise ValueError(f"{path} has {np.count_nonzero(~cloud.finite):,} Gaussians with values that are not finite")
-    return cloud
-
-
-def unit_quats(quats: np.ndarray) -> np.ndarray:
-    """Normalised quaternions; a zero quaternion, which is not a rotation, becomes NaN."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
 
 
 def num_rest(path: Path, table: np.ndarray) -> int:
