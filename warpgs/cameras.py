@@ -50,9 +50,12 @@ class Camera:
             last, in its own axes at the middle row, which ``viewmat`` is the pose of: a rotation vector of at most a
             right angle [radians] and a translation [scene units]. View-dependent colours are those at the middle row.
             None for a global shutter.
+        id: Of the device that films. Frames with one id are one video: their neighbours in time show how objects move,
+            and they have one exposure and white balance.
 
     Raises:
-        ValueError: On a wrong shape, dtype, device or size, or a time that is not a number.
+        ValueError: On a wrong shape, dtype, device or size, a time that is not a number, or an id that is not
+            a whole number from 0 on.
     """
 
     viewmat: Float[Tensor, "4 4"]
@@ -62,6 +65,7 @@ class Camera:
     time: float = 0.0
     distortion: Distortion | None = None
     motion: Float[Tensor, "2 3"] | None = None
+    id: int = 0
 
     def __post_init__(self) -> None:
         check_tensor("viewmat", self.viewmat, (4, 4), {})
@@ -76,6 +80,9 @@ class Camera:
         object.__setattr__(self, "width", as_whole_number(self.width))
         object.__setattr__(self, "height", as_whole_number(self.height))
         check_image_size(self.width, self.height)
+        object.__setattr__(self, "id", as_whole_number(self.id))
+        if isinstance(self.id, bool) or not isinstance(self.id, int) or self.id < 0:
+            raise ValueError(f"id must be a whole number from 0 on, got {one_line_repr(self.id)}")
         object.__setattr__(self, "time", as_number("time", self.time))
 
     @property

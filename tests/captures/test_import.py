@@ -10,7 +10,7 @@ import torch
 from tests.data import captures, layouts
 from warpgs.captures import opening
 from warpgs.captures.check import check_capture
-from warpgs.captures.import_capture import import_capture, time_steps
+from warpgs.captures.import_capture import import_capture
 from warpgs.captures.opening import load_capture
 from warpgs.cli import main
 from warpgs.data.capture import Capture
@@ -169,19 +169,6 @@ def test_a_source_with_a_damaged_frame_leaves_nothing_behind(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
 
 
-@pytest.mark.parametrize(
-    ("times", "steps"),
-    [([0.0, 0.5, 1.0], [0, 1, 2]), ([0.2, 0.3, 0.6], [0, 1, 4]), ([0.5], [0]), ([0.0, 0.0, 1.0], [0, 0, 1])],
-)
-def test_time_steps_are_the_smallest_whole_numbers(times, steps):
-    assert time_steps(times) == steps
-
-
-def test_irregular_times_keep_six_digits():
-    times = [0.0, 0.1234567, 0.3, 1.0]
-    assert np.allclose(np.array(time_steps(times)) / 10**6, times, atol=1e-6)
-
-
 def test_point_colors_that_do_not_fit_the_points_are_refused(root):
     captures.write_array(root / "point_colors.npy", np.zeros((3, 3), np.uint8))
     with pytest.raises(ValueError, match=r"point_colors\.npy must hold bytes of shape \[10, 3\]"):
@@ -313,7 +300,7 @@ def test_a_damaged_size_of_images_does_not_keep_a_layout_from_being_recognized(t
 def test_the_index_is_complete(tmp_path):
     import_capture(layouts.write_llff(tmp_path / "source"), tmp_path / "copy")
     metadata = json.loads((tmp_path / "copy/metadata.json").read_text())
-    assert metadata["00007_cam02"] == {"time_id": 7, "warp_id": 7, "appearance_id": 7, "camera_id": 1}
+    assert metadata["00007_cam02"] == {"time_id": 7, "warp_id": 7, "appearance_id": 7, "camera_id": 2}
     assert metadata["frame_00007"]["camera_id"] == 0
 
 

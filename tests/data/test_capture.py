@@ -43,6 +43,29 @@ def test_frames_are_sorted_by_their_times_and_names():
     assert capture.in_time(("f2", "f0", "f1")) == ["f1", "f2", "f0"]
 
 
+def rig(**moments):
+    """A capture with frames of some (camera, time)."""
+    capture = make_capture(xs=(0.0,) * len(moments))[0]
+    given = dict(zip(moments, capture.cameras.values(), strict=True))
+    cameras = {name: dataclasses.replace(given[name], id=i, time=time) for name, (i, time) in moments.items()}
+    return dataclasses.replace(capture, cameras=cameras, train=list(moments))
+
+
+def test_frames_are_told_by_their_camera_in_the_order_of_time():
+    capture = rig(a=(1, 0.5), b=(0, 0.6), c=(1, 0.1), d=(0, 0.2))
+    assert capture.by_camera(capture.train) == {0: ["d", "b"], 1: ["c", "a"]}
+
+
+def test_neighbours_are_frames_of_one_camera():
+    capture = rig(a=(0, 0.0), b=(1, 0.1), c=(0, 0.2), d=(1, 0.3), e=(0, 0.4))
+    assert capture.neighbours(capture.train) == [("a", "c"), ("c", "e"), ("b", "d")]
+
+
+def test_frames_of_an_id_with_two_frames_of_one_time_have_no_neighbours():
+    capture = rig(a=(0, 0.0), b=(0, 0.0), c=(0, 0.5), d=(1, 0.0), e=(1, 0.5))
+    assert capture.neighbours(capture.train) == [("d", "e")]
+
+
 def test_a_frame_is_read_once():
     capture, read = make_capture()
     assert capture.frame("f1") is capture.frame("f1")

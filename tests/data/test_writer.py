@@ -119,3 +119,32 @@ def test_a_folder_without_an_index_is_not_a_capture(tmp_path):
     writer.write_scene(tmp_path, UNITS, POINTS, 0.1, 4.0)
     with pytest.raises(ValueError, match=r"dataset\.json is missing"):
         load_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("times", "steps"),
+    [([0.0, 0.5, 1.0], [0, 1, 2]), ([0.2, 0.3, 0.6], [0, 1, 4]), ([0.5], [0]), ([0.0, 0.0, 1.0], [0, 0, 1])],
+)
+def test_time_steps_are_the_smallest_whole_numbers(times, steps):
+    assert writer.time_steps(times) == steps
+
+
+def test_irregular_times_keep_six_digits():
+    times = [0.0, 0.1234567, 0.3, 1.0]
+    assert np.allclose(np.array(writer.time_steps(times)) / 10**6, times, atol=1e-6)
+
+
+def test_offsets_between_cameras_are_read_back_as_written(root):
+    seconds = {"a": 0.0, "b": 0.5, "c": 1.0, "d": 0.37}
+    writer.write_index(root, seconds, camera_ids={"a": 0, "b": 0, "c": 0, "d": 1})
+    metadata = json.loads((root / "metadata.json").read_text())
+    cameras = load_capture(root).cameras
+    assert [metadata[name]["time_id"] for name in TIMES] == [0, 500_000, 1_000_000, 370_000]
+    assert {name: cameras[name].time for name in TIMES} == pytest.approx(seconds)
+    assert [cameras[name].id for name in TIMES] == [0, 0, 0, 1]
+
+
+def test_times_before_0_are_written_from_the_first_on(root):
+    writer.write_index(root, {"a": -2, "b": 0, "c": 4, "d": 1})
+    metadata = json.loads((root / "metadata.json").read_text())
+    assert [metadata[name]["time_id"] for name in TIMES] == [0, 2, 6, 3]

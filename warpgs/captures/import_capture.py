@@ -19,9 +19,6 @@ from .opening import load_capture
 FACTORS = (1, 2)
 """Downscaling factors of the images and masks that are written."""
 
-MAX_STEPS = 10**6
-"""Time steps from the first to the last frame, unless fewer represent all times."""
-
 MAX_HALF = 6e4
 """Maximum of the stored inverse depth; half floats end at 65504."""
 
@@ -121,12 +118,14 @@ def _write_index(folder: Path, capture: Capture, names: list[str], val: list[str
     colors = None if capture.point_colors is None else capture.point_colors.numpy()
     near, far = depth_range(_depths(capture))
     writer.write_scene(folder, SceneUnits(np.zeros(3), 1.0), points, near, far, colors)
-    times = [capture.cameras[name].time for name in names]
-    steps = dict(zip(names, time_steps(times), strict=True))
-    trained = {steps[name] for name in names if name not in val}
-    other_camera = {name: int(name in val and steps[name] in trained) for name in names}
+    cameras = {name: capture.cameras[name] for name in names}
     writer.write_index(
-        folder, steps, val, other_camera, estimated_masks=capture.estimated_masks, readout=capture.readout
+        folder,
+        {name: camera.time for name, camera in cameras.items()},
+        val,
+        {name: camera.id for name, camera in cameras.items()},
+        estimated_masks=capture.estimated_masks,
+        readout=capture.readout,
     )
 
 
@@ -134,16 +133,3 @@ def _depths(capture: Capture) -> np.ndarray:
     """Depths of the points in at most 40 training cameras [scene units]."""
     cameras = [capture.cameras[name] for name in capture.train[:: max(1, len(capture.train) // 20)]]
     return np.concatenate([camera.project(capture.points)[2].numpy() for camera in cameras])
-
-
-def time_steps(times: list[float]) -> list[int]:
-    """Whole numbers in proportion to some times, from 0 on: as few as represent all of them, if that is possible."""
-    low, high = min(times), max(times)
-    distinct = np.unique(times)
-    if len(distinct) == 1:
-        return [0] * len(times)
-    relative = (np.array(times) - low) / (high - low)
-    smallest = np.diff(distinct).min() / (high - low)
-    fewest = round(1.0 / smallest) if smallest > 1.0 / MAX_STEPS else MAX_STEPS
-    exact = np.abs(relative * fewest - (relative * fewest).round()).max() < 0.01
-    return (relative * (fewest if exact else MAX_STEPS)).round().astype(int).tolist()

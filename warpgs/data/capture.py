@@ -5,6 +5,7 @@ import reprlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import Any, Literal
 
 import torch
@@ -279,6 +280,21 @@ class Capture:
     def in_time(self, names: Iterable[str]) -> list[str]:
         """Names of frames in the order of their times; those of the same time in the order of the names."""
         return sorted(names, key=lambda name: (self.cameras[name].time, name))
+
+    def by_camera(self, names: Iterable[str]) -> dict[int, list[str]]:
+        """Names of the frames of each ``Camera.id``, ids in ascending order, frames as ``in_time``."""
+        ordered = self.in_time(names)
+        ids = sorted({self.cameras[name].id for name in ordered})
+        return {i: [name for name in ordered if self.cameras[name].id == i] for i in ids}
+
+    def neighbours(self, names: Iterable[str]) -> list[tuple[str, str]]:
+        """Pairs of frames of one camera, one after the other in time.
+
+        An id with several frames of one time has none: it stands for several cameras that are not known.
+        """
+        pairs = [[*pairwise(frames)] for frames in self.by_camera(names).values()]
+        times = {name: camera.time for name, camera in self.cameras.items()}
+        return [pair for of_camera in pairs if all(times[a] < times[b] for a, b in of_camera) for pair in of_camera]
 
     def frame(self, name: str) -> Frame:
         """A frame, from the cache if it is among the last ``cache_frames`` read.

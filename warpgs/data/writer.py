@@ -35,6 +35,10 @@ MAX_ID_BYTES = 200
 written."""
 
 
+MAX_STEPS = 10**6
+"""Time steps from the first to the last frame, unless fewer represent all times."""
+
+
 def is_plain_id(name: str) -> bool:
     """Whether a frame can have this id: it is one plain file name, and does not begin with a dot."""
     return bool(name) and not name.startswith(".") and not any(character in name for character in "/\\\0")
@@ -179,7 +183,7 @@ def check_holdout(holdout: int) -> None:
 
 def write_index(
     root: Path,
-    time_ids: Mapping[str, int],
+    times: Mapping[str, int | float],
     val: Collection[str] = (),
     camera_ids: Mapping[str, int] | None = None,
     *,
@@ -192,23 +196,41 @@ def write_index(
 
     Args:
         root: Folder of the capture.
-        time_ids: Time step of every frame, in the order of dataset.json.
+        times: Time of every frame on one clock, in any unit and the order of dataset.json. Whole numbers from 0 on are
+            written as they are, others as their ``time_steps``.
         val: Frames to evaluate on; all others are trained on.
         camera_ids: Camera of every frame; all are camera 0 if None.
         estimated_masks: Whether the masks are estimates, see ``Capture.estimated_masks``.
         readout: See ``Capture.readout``.
     """
-    index = {step: k for k, step in enumerate(sorted(set(time_ids.values())))}
+    are_steps = all(time >= 0 and float(time).is_integer() for time in times.values())
+    steps = (
+        [int(time) for time in times.values()] if are_steps else time_steps([float(time) for time in times.values()])
+    )
+    index = {step: k for k, step in enumerate(sorted(set(steps)))}
     metadata = {}
-    for name, step in time_ids.items():
+    for name, step in zip(times, steps, strict=True):
         camera_id = 0 if camera_ids is None else camera_ids[name]
         metadata[name] = {"time_id": step, "warp_id": index[step], "appearance_id": index[step], "camera_id": camera_id}
     write_json(root / "metadata.json", metadata)
-    train_ids, val_ids = ([name for name in time_ids if (name in val) == held_out] for held_out in (False, True))
-    counts = {"count": len(time_ids), "num_exemplars": len(train_ids)}
-    splits = {"ids": [*time_ids], "train_ids": train_ids, "val_ids": val_ids}
+    train_ids, val_ids = ([name for name in times if (name in val) == held_out] for held_out in (False, True))
+    counts = {"count": len(times), "num_exemplars": len(train_ids)}
+    splits = {"ids": [*times], "train_ids": train_ids, "val_ids": val_ids}
     others = ({"masks": ESTIMATED} if estimated_masks else {}) | ({"readout": readout} if readout else {})
     write_json(root / "dataset.json", {**counts, "layout": LAYOUT, **others, **splits})
+
+
+def time_steps(times: Sequence[float]) -> list[int]:
+    """Whole numbers in proportion to some times, from 0 on: as few as represent all of them, if that is possible."""
+    low, high = min(times), max(times)
+    distinct = np.unique(times)
+    if len(distinct) == 1:
+        return [0] * len(times)
+    relative = (np.array(times) - low) / (high - low)
+    smallest = np.diff(distinct).min() / (high - low)
+    fewest = round(1.0 / smallest) if smallest > 1.0 / MAX_STEPS else MAX_STEPS
+    exact = np.abs(relative * fewest - (relative * fewest).round()).max() < 0.01
+    return (relative * (fewest if exact else MAX_STEPS)).round().astype(int).tolist()
 
 
 def _reduced_size(image: np.ndarray, factor: int) -> tuple[int, int]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from warpgs.config.builtin import NAMES, PREFIX
+from warpgs.data.camera_ids import with_camera_ids
 from warpgs.data.capture import Capture
 from warpgs.data.colmap_folders import find_models
 from warpgs.data.image_circle import with_image_circle
@@ -90,7 +91,7 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     layout = layout or FALLBACK
     capture = LOADERS[layout].load(root, options)
     _require_sides(root, capture)
-    capture = with_image_circle(capture)
+    capture = with_camera_ids(with_image_circle(capture))
     capture.layout = describe_layout(root, layout, dataset)
     try:
         return with_readout(capture, capture.readout if options.readout is None else options.readout)

@@ -159,7 +159,7 @@ def _read_static(path: Path, size: tuple[int, int], image: Path) -> Bool[np.ndar
 
 
 def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
-    """mv_images/<time>/cam<camera>: what the rig's other cameras saw at the times of the video."""
+    """mv_images/<time>/cam<camera>: what the rig's other cameras saw at the times of the video, which is camera 0."""
     found = []
     for path in sorted((root / EVALUATION).glob("*/cam*.jpg")) + sorted((root / EVALUATION).glob("*/cam*.png")):
         number = re.fullmatch(r"cam(\d{1,3})", path.stem)
@@ -174,7 +174,15 @@ def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
         name = f"{path.parent.name}_{path.stem}"
         read_mask = None if mask is None else partial(_read_static, mask, image=path)
         found.append(
-            PosedFrame(name, source.lens, source.pose, float(time), partial(read_resized_image, path), read_mask)
+            PosedFrame(
+                name,
+                source.lens,
+                source.pose,
+                float(time),
+                partial(read_resized_image, path),
+                read_mask,
+                camera=camera + 1,
+            )
         )
     return found
 

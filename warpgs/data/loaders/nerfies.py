@@ -8,7 +8,7 @@ covisible/<factor>x/val/<id>.png.
 import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -90,10 +90,11 @@ class NerfiesLoader(ABC):
         times, time_source = _times(root / "metadata.json", metadata, [*split.train, *split.val])
         factor = options.factor or self.default_factor
         files = _find_files(root, factor, split, incomplete_masks, options.depth)
-        cameras, lenses = {}, {}
+        ids, cameras, lenses = _camera_ids(root / "metadata.json", metadata, [*times]), {}, {}
         for name, time in times.items():
             path = find_file(root / "camera", f"{name}.json") or root / f"camera/{name}.json"
-            cameras[name], lenses[name] = read_camera(path, units, factor, time, options.distortion)
+            camera, lenses[name] = read_camera(path, units, factor, time, options.distortion)
+            cameras[name] = replace(camera, id=ids[name])
         points, colors = read_points(root, units)
         read_depth = partial(_read_depth, self, units)
         reader = _FrameReader(cameras, lenses, files, frozenset(split.train), options.perturbation, read_depth)
@@ -176,6 +177,18 @@ def _times(path: Path, metadata: dict[str, Any], names: list[str]) -> tuple[dict
         problem = f"{without} has no time_id, which {len(given['time_id'])} of {len(names)} frames have"
     text = with_steps(f"times from {key} in {path.name}", [float(step) for step in steps[key].values()])
     return {name: (step - first) / length for name, step in steps[key].items()}, TimeSource(text, problem)
+
+
+def _camera_ids(path: Path, metadata: dict[str, Any], names: list[str]) -> dict[str, int]:
+    """The camera_id of each frame; 0 if no frame has one."""
+    ids = {name: metadata_field(metadata, name, "camera_id") for name in names}
+    if all(i is None for i in ids.values()):
+        return dict.fromkeys(names, 0)
+    for name, i in ids.items():
+        if isinstance(i, bool) or not isinstance(i, int) or not 0 <= i <= MAX_STEP:
+            others = f"which {sum(i is not None for i in ids.values())} of {len(ids)} frames have"
+            raise ValueError(f"{path}: {name} has no camera_id from 0 on, {others}: {reprlib.repr(i)}")
+    return ids
 
 
 @dataclass(frozen=True)

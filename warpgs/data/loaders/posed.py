@@ -52,6 +52,7 @@ class PosedFrame:
         image: Reads the RGB image in a size; a fourth channel is 0 where it shows the world's background alone.
         static_mask: Reads the static mask; None if the frame has none.
         inverse_depth: Reads inverse depth along the optical axis, NaN where unknown; None if the frame has none.
+        camera: See ``Camera.id``.
     """
 
     name: str
@@ -61,6 +62,7 @@ class PosedFrame:
     image: Callable[[Size], UInt8[np.ndarray, "H W C"]]
     static_mask: Callable[[Size], Bool[np.ndarray, "H W"]] | None = None
     inverse_depth: Callable[[Size], Float[np.ndarray, "H W"]] | None = None
+    camera: int = 0
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:
@@ -264,7 +266,7 @@ def _camera(frame: PosedFrame, lens: Lens, units: SceneUnits, time: float) -> Ca
         raise ValueError("the pose is not finite in scene units")
     if not 0.0 <= time <= 1.0:
         raise ValueError(f"the time {time} is not in [0, 1]")
-    return camera
+    return replace(camera, id=frame.camera)
 
 
 @dataclass(frozen=True)
