@@ -9,6 +9,7 @@ import torch
 from tests import tiny
 from tests.data.captures import ids_of, write_capture
 from tests.scenes import along_z
+from warpgs.cameras import Camera
 from warpgs.captures.opening import load_capture
 from warpgs.data.capture import Capture
 from warpgs.distortion import Distortion
@@ -69,6 +70,43 @@ def test_lenses_have_one_limit_unless_it_is_inside_an_image(lens, coefficients, 
     assert limits[0] != limits[1]
     assert cameras.have_one_lens == shares
     assert [one.limit for one in cameras.lenses] == ([min(limits)] * 2 if shares else limits)
+
+
+def with_circles(capture, circles):
+    """The capture with fisheye lenses, whose circular images end at these angles, of its first cameras."""
+    cameras = {name: capture.cameras[name] for name in capture.train[: len(circles)]}
+    lenses = {n: Distortion.fisheye([0.03], c.K, c.size) for n, c in cameras.items()}
+    lenses = {
+        n: dataclasses.replace(lens, circle=circle) for (n, lens), circle in zip(lenses.items(), circles, strict=True)
+    }
+    return capture.with_cameras({n: dataclasses.replace(c, distortion=lenses[n]) for n, c in cameras.items()})
+
+
+@pytest.mark.parametrize("resident_bytes", [PLENTY, 0])
+def test_each_view_has_what_its_camera_shows(capture, resident_bytes):
+    round_ones = with_circles(capture, [0.2, 0.3, 0.2])
+    views = views_of(round_ones, resident_bytes)
+    for index, name in enumerate(capture.train[:4]):
+        views.select(index)
+        expected = round_ones.cameras[name].shown
+        for found in (views[index].shown, views.selected().shown):
+            assert found is expected or torch.equal(found, expected)
+    assert not views[0].shown.all()
+
+
+def test_what_cameras_of_one_lens_show_is_computed_once(capture, monkeypatch):
+    views = views_of(with_circles(capture, [0.2, 0.3, 0.2]))
+    monkeypatch.setattr(Camera, "shown", property(lambda _: pytest.fail("computed again")))
+    assert views[0].shown is views[2].shown is not views[1].shown
+
+
+@pytest.mark.parametrize(("circles", "shares"), [([0.2, 0.2], True), ([0.2, 0.3], False)])
+def test_lenses_are_one_if_they_show_the_same_pixels(circles, shares):
+    pinhole = along_z(20.0, (50, 37))
+    lens = Distortion.fisheye([0.1], pinhole.K, pinhole.size)
+    lenses = [dataclasses.replace(lens, circle=circle) for circle in circles]
+    cameras = StackedCameras([dataclasses.replace(pinhole, distortion=one) for one in lenses], CPU)
+    assert cameras.have_one_lens == shares
 
 
 def test_each_view_has_the_motion_of_its_camera(capture):

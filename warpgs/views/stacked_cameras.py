@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -18,14 +18,17 @@ class StackedCameras:
     Attributes:
         lenses: The lens of each camera; None for a pinhole. They have one limit if no image shows anything beyond it:
             COLMAP may find a lens for every image.
+        shown: ``Camera.shown`` of each camera, on the device; cameras of one lens have one mask.
     """
 
     lenses: list[Distortion | None]
+    shown: list[Bool[Tensor, "H W"] | None]
 
     def __init__(self, cameras: Sequence[Camera], device: torch.device) -> None:
         self._viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device)
         self._Ks = torch.stack([camera.K for camera in cameras]).to(device)
         self.lenses = _with_one_limit(cameras)
+        self.shown = _shown(cameras, device)
         none, still = torch.zeros(0, dtype=torch.float32), torch.zeros(2, 3, dtype=torch.float32)
         coefficients = [none if lens is None else lens.coefficients for lens in self.lenses]
         self._coefficients = pad_sequence(coefficients, batch_first=True).to(device)
@@ -35,22 +38,39 @@ class StackedCameras:
 
     @property
     def have_one_lens(self) -> bool:
-        """Whether all lenses are of one kind, limit and circle, which are constants of a CUDA graph."""
-        return len({None if lens is None else (lens.lens, lens.limit, lens.circle) for lens in self.lenses}) == 1
+        """Whether all lenses are of one kind and limit and show the same pixels: constants of a CUDA graph."""
+        kinds = {None if lens is None else (lens.lens, lens.limit) for lens in self.lenses}
+        return len(kinds) == len({id(mask) for mask in self.shown}) == 1
 
-    def at(self, index: Int64[Tensor, "1"], lens: Distortion | None, size: tuple[int, int]) -> Camera:
+    def at(self, index: Int64[Tensor, "1"], number: int, size: tuple[int, int]) -> Camera:
         """The camera of an index on the device, at time 0.
 
         Args:
             index: The index.
-            lens: Its lens, of which only the coefficients are read from the device.
+            number: The index on the host, of a camera of the same lens: only its coefficients come from the device.
             size: (width, height) of its image [px].
         """
-        of_cameras = (self._viewmats, self._Ks, self._coefficients)
+        lens, of_cameras = self.lenses[number], (self._viewmats, self._Ks, self._coefficients)
         viewmat, K, k = (values.index_select(0, index)[0] for values in of_cameras)
         distortion = None if lens is None else replace(lens, coefficients=k[: len(lens.coefficients)])
         motion = None if self._motions is None else self._motions.index_select(0, index)[0]
         return Camera(viewmat, K, *size, distortion=distortion, motion=motion)
+
+
+def _shown(cameras: Sequence[Camera], device: torch.device) -> list[Bool[Tensor, "H W"] | None]:
+    masks: dict[tuple[object, ...], Tensor | None] = {}
+    for camera in cameras:
+        if (key := _intrinsics(camera)) not in masks:
+            mask = camera.shown
+            masks[key] = None if mask is None else mask.to(device)
+    return [masks[_intrinsics(camera)] for camera in cameras]
+
+
+def _intrinsics(camera: Camera) -> tuple[object, ...]:
+    """What ``Camera.shown`` depends on."""
+    if (lens := camera.distortion) is None:
+        return ()
+    return lens.circle, *camera.size, *camera.K.flatten().tolist(), *lens.coefficients.tolist()
 
 
 def _with_one_limit(cameras: Sequence[Camera]) -> list[Distortion | None]:

@@ -14,7 +14,6 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import resize_inverse
-from warpgs.distortion import Distortion
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
@@ -72,7 +71,7 @@ class Views:
         resident: Whether all views are on the device.
         cache: The file of those that are not resident, so that each is decoded once; None if all are.
         uses_graphs: Whether work on the selected view is captured in CUDA graphs: only if all views have one size,
-            and lenses of one kind and limit, which are constants of a graph.
+            and lenses of one kind and limit that show the same pixels, which are constants of a graph.
         index: [1] index of the selected view, on the device.
         mask_trust: [T] ``View.mask_trust`` of each view, at first 1; on the device.
         num_pixels: Number of pixels of all views.
@@ -100,7 +99,7 @@ class Views:
         # New threads would use the first GPU, whatever the rank.
         setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
         self._read_ahead, self._slot = ReadAhead(self._reader.read, setup), Slot(device)
-        self.index, self._lens = torch.zeros(1, dtype=torch.int64, device=device), self._cameras.lenses[0]
+        self.index, self._number = torch.zeros(1, dtype=torch.int64, device=device), 0
         self.mask_trust = torch.ones(len(capture.train), dtype=torch.float32, device=device)
         sizes = [camera.size for camera in cameras]
         self.num_pixels = sum(width * height for width, height in sizes)
@@ -120,7 +119,7 @@ class Views:
 
     def __getitem__(self, index: int) -> View:
         on_device = self._pixels(index).map(lambda tensor: tensor.to(self.device))
-        return self._view(on_device, torch.full((1,), index, device=self.device), self._cameras.lenses[index])
+        return self._view(on_device, torch.full((1,), index, device=self.device), index)
 
     def _pixels(self, index: int) -> Pixels:
         """The pixels of a view, on the device if they are resident, else in host memory."""
@@ -180,15 +179,17 @@ class Views:
     def select(self, index: int) -> None:
         """Selects the view of an index, in the order of the current stream."""
         self.index.fill_(index)
-        self._lens = self._cameras.lenses[index]
+        self._number = index
         if not self.resident:
             self._slot.fill(self._read_ahead.take(index))
 
     def selected(self) -> View:
         """The selected view, read from addresses that stay the same if ``uses_graphs``."""
         if not self.resident:
-            return self._view(self._slot.pixels, self.index, self._lens)
-        return self._view(self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index, self._lens)
+            return self._view(self._slot.pixels, self.index, self._number)
+        return self._view(
+            self._all.map(lambda tensors: tensors.index_select(0, self.index)[0]), self.index, self._number
+        )
 
     def divide_by(self, gains: Float[Tensor, "T 3"]) -> None:
         """Divides images by a factor per channel."""
@@ -242,12 +243,12 @@ class Views:
     def _corrected(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
         return camera if self.poses is None else self.poses.moved(camera, index)
 
-    def _view(self, pixels: Pixels, index: Int64[Tensor, "1"], lens: Distortion | None) -> View:
-        """A view on the device."""
+    def _view(self, pixels: Pixels, index: Int64[Tensor, "1"], number: int) -> View:
+        """A view on the device; ``number`` is its index, or with CUDA graphs any: its camera has the same lens."""
         time, mask_trust = (values.index_select(0, index)[0] for values in (self._times, self.mask_trust))
         height, width = pixels.static_mask.shape
         image = pixels.image.float() / 255.0
-        camera = self._cameras.at(index, lens, (width, height))
+        camera = self._cameras.at(index, number, (width, height))
         return View(
             self._corrected(camera, index),
             time,
@@ -255,6 +256,6 @@ class Views:
             pixels.static_mask,
             pixels.mask_border,
             pixels.inverse_depth.float(),
-            camera.shown,
+            self._cameras.shown[number],
             mask_trust,
         )
