@@ -15,6 +15,8 @@ import torch._dynamo  # noqa: F401  # optimizers import it, which takes seconds
 from torch.distributed import TCPStore
 
 from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture
+from warpgs.distortion import Distortion
 from warpgs.files import write_json
 from warpgs.runs import checkpoint
 from warpgs.runs.checkpoint import _hash
@@ -166,13 +168,26 @@ def by_command(folder: Path, config: TrainConfig) -> int:
 
 
 def with_differences(folder: Path, config: TrainConfig, what: str) -> int:
-    """Trains by the command; rank 1 has other options, or another capture under the same path."""
-    if os.environ["RANK"] == "1" and what == "the options":
-        config = dataclasses.replace(config, seed=1)
-    elif os.environ["RANK"] == "1":
+    """Trains by the command; the ranks have other options, or other captures under the same path."""
+    if what == "options":
+        config = dataclasses.replace(config, seed=int(os.environ["RANK"]))
+    else:
         whole = script.open_capture
-        script.open_capture = lambda *_: dataclasses.replace(c := whole(*_), points=c.points + 1e-3)
+        script.open_capture = lambda *_: _changed(whole(*_), what, float(os.environ["RANK"]))
     return by_command(folder, config)
+
+
+def _changed(capture: Capture, what: str, amount: float) -> Capture:
+    """The capture with other points, or another camera: its shutter, or the circle of its fisheye lens."""
+    if what == "points":
+        return dataclasses.replace(capture, points=capture.points + 1e-3 * amount)
+    camera = capture.cameras[capture.train[0]]
+    if what == "shutter":
+        changed = dataclasses.replace(camera, motion=torch.full((2, 3), 1e-3 * amount))
+    else:
+        lens = dataclasses.replace(Distortion.fisheye([], camera.K, camera.size), circle=3.0 + 0.1 * amount)
+        changed = dataclasses.replace(camera, distortion=lens)
+    return capture.with_cameras({capture.train[0]: changed})
 
 
 def try_masks(folder: Path, config: TrainConfig) -> None:

@@ -176,9 +176,10 @@ def test_a_rank_that_fails_says_why_and_the_others_end_silently(data, tmp_path):
     assert two_ranks.errors(tmp_path, 1) == ["warpgs train: rank 1 has a reason"]
 
 
-@pytest.mark.parametrize("what", ["the options", "the capture"])
-def test_ranks_with_different_options_or_captures_are_refused_in_one_line(data, tmp_path, what):
-    assert two_ranks.start(tmp_path, two_ranks.with_differences, config_of(data, tmp_path), what) == [2, 2]
+@pytest.mark.parametrize("difference", ["options", "points", "shutter", "circle"])
+def test_ranks_with_different_options_or_captures_are_refused_in_one_line(data, tmp_path, difference):
+    assert two_ranks.start(tmp_path, two_ranks.with_differences, config_of(data, tmp_path), difference) == [2, 2]
+    what = "the options" if difference == "options" else "the capture"
     (line,) = two_ranks.errors(tmp_path, 0) + two_ranks.errors(tmp_path, 1)
     assert line == f"warpgs train: expected {what} to be the same on all ranks, rank 1 has another than rank 0"
     assert not (tmp_path / "run").exists()

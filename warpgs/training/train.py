@@ -5,6 +5,9 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
+
+from torch import Tensor
 
 from warpgs.captures.check import require_fit
 from warpgs.captures.opening import open_capture
@@ -269,13 +272,20 @@ def _checked(capture: Capture, config: TrainConfig, log: Log) -> Capture:
     if ranks.num_ranks() == 1:
         return capture
     ranks.require_same("the options", json.dumps(dataclasses.asdict(config), default=str).encode())
-    cameras = [(name, camera.size, camera.time) for name, camera in sorted(capture.cameras.items())]
-    values = [capture.points]
-    for _, camera in sorted(capture.cameras.items()):
-        values += [camera.viewmat, camera.K, *([camera.distortion.coefficients] if camera.distortion else [])]
-    numbers = b"".join(tensor.cpu().numpy().tobytes() for tensor in values)
-    ranks.require_same("the capture", repr((cameras, capture.train, capture.val)).encode() + numbers)
+    content = (sorted(capture.cameras.items()), capture.points, capture.train, capture.val)
+    ranks.require_same("the capture", _as_bytes(content))
     return capture
+
+
+def _as_bytes(value: Any) -> bytes:
+    """All that a value consists of, every field of dataclasses and every bit of tensors included."""
+    if isinstance(value, Tensor):
+        return repr(value.shape).encode() + value.cpu().numpy().tobytes()
+    if dataclasses.is_dataclass(value):
+        return _as_bytes([getattr(value, field.name) for field in dataclasses.fields(value)])
+    if isinstance(value, list | tuple):
+        return b"(%b)" % b",".join(map(_as_bytes, value))
+    return repr(value).encode()
 
 
 def _read_evaluation_frames(capture: Capture, config: TrainConfig, quiet: bool) -> None:
