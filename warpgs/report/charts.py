@@ -1,9 +1,12 @@
 """Line charts as SVG."""
 
-import html
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
+
+from markupsafe import Markup
+
+from .templates import render
 
 COLORS = ("#3b82f6", "#f97316", "#10b981", "#e11d48", "#8b5cf6", "#ca8a04", "#06b6d4", "#6b7280")
 WIDTH, HEIGHT = 460, 230
@@ -28,32 +31,52 @@ def color_of(index: int) -> str:
     return COLORS[index % len(COLORS)]
 
 
-def chart(title: str, x_name: str, series: Sequence[Series], dots: bool = False) -> str:
+class Curve(NamedTuple):
+    """A curve as drawn.
+
+    Attributes:
+        name, color: As of its series.
+        line: (x, y) of its points [px].
+        values: (x, y) of points that show their value under the pointer [px], and that value.
+        is_marked: Whether these points are drawn.
+    """
+
+    name: str
+    color: str
+    line: list[tuple[float, float]]
+    values: list[tuple[float, float, str]]
+    is_marked: bool
+
+
+def chart(title: str, x_name: str, series: Sequence[Series], dots: bool = False) -> Markup:
     """A chart as an SVG element; an empty string if no curve has a point."""
-    curves = [Series(s.name, s.color, _averaged(s.points)) for s in series if s.points]
-    if not curves:
-        return ""
-    xs = [x for s in curves for x, _ in s.points]
-    ys = [y for s in curves for _, y in s.points]
+    averaged = [Series(s.name, s.color, _averaged(s.points)) for s in series if s.points]
+    if not averaged:
+        return Markup("")
+    xs = [x for s in averaged for x, _ in s.points]
+    ys = [y for s in averaged for _, y in s.points]
     x_range, y_range = (min(xs), max(xs)), _padded(min(ys), max(ys))
-    parts = [f'<text class="title" x="{LEFT}" y="16">{html.escape(title)}</text>']
-    parts += [_y_tick(y, y_range) for y in _ticks(*y_range)]
-    parts += [_x_tick(x, x_range) for x in _ticks(*x_range)]
-    parts.append(
-        f'<text class="tick" x="{WIDTH - RIGHT}" y="{HEIGHT - 2}" text-anchor="end">{html.escape(x_name)}</text>'
+    return render(
+        "chart.svg",
+        title=title,
+        x_name=x_name,
+        width=WIDTH,
+        height=HEIGHT,
+        left=LEFT,
+        right=WIDTH - RIGHT,
+        x_ticks=[(_pixel_x(x, x_range), f"{x:.6g}") for x in _ticks(*x_range)],
+        y_ticks=[(_pixel_y(y, y_range), f"{y:.4g}") for y in _ticks(*y_range)],
+        curves=[_curve(s, x_range, y_range, dots) for s in averaged],
     )
-    for s in curves:
-        at = [(_pixel_x(x, x_range), _pixel_y(y, y_range)) for x, y in s.points]
-        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in at)
-        parts.append(f'<polyline points="{line}" stroke="{s.color}"><title>{html.escape(s.name)}</title></polyline>')
-        is_marked = dots or len(at) == 1
-        stride = 1 if is_marked else math.ceil(len(at) / MAX_VALUES)
-        for k in range(0, len(at), stride):
-            (x, y), (x_value, y_value) = at[k], s.points[k]
-            look = f'r="2.5" fill="{s.color}"' if is_marked else 'r="5" class="value"'
-            value = f"{html.escape(s.name)}, {html.escape(x_name)} {x_value:.6g}: {y_value:.5g}"
-            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" {look}><title>{value}</title></circle>')
-    return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{html.escape(title)}">{"".join(parts)}</svg>'
+
+
+def _curve(series: Series, x_range: tuple[float, float], y_range: tuple[float, float], dots: bool) -> Curve:
+    line = [(_pixel_x(x, x_range), _pixel_y(y, y_range)) for x, y in series.points]
+    is_marked = dots or len(line) == 1
+    stride = 1 if is_marked else math.ceil(len(line) / MAX_VALUES)
+    shown = list(zip(line, series.points, strict=True))[::stride]
+    values = [(*at, f"{x:.6g}: {y:.5g}") for at, (x, y) in shown]
+    return Curve(series.name, series.color, line, values, is_marked)
 
 
 def _averaged(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -78,18 +101,8 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 def _pixel_x(x: float, bounds: tuple[float, float]) -> float:
-    return LEFT + (x - bounds[0]) / ((bounds[1] - bounds[0]) or 1.0) * (WIDTH - LEFT - RIGHT)
+    return round(LEFT + (x - bounds[0]) / ((bounds[1] - bounds[0]) or 1.0) * (WIDTH - LEFT - RIGHT), 1)
 
 
 def _pixel_y(y: float, bounds: tuple[float, float]) -> float:
-    return HEIGHT - BOTTOM - (y - bounds[0]) / (bounds[1] - bounds[0]) * (HEIGHT - TOP - BOTTOM)
-
-
-def _y_tick(y: float, bounds: tuple[float, float]) -> str:
-    at = _pixel_y(y, bounds)
-    line = f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>'
-    return f'{line}<text class="tick" x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{y:.4g}</text>'
-
-
-def _x_tick(x: float, bounds: tuple[float, float]) -> str:
-    return f'<text class="tick" x="{_pixel_x(x, bounds):.1f}" y="{HEIGHT - 14}" text-anchor="middle">{x:.6g}</text>'
+    return round(HEIGHT - BOTTOM - (y - bounds[0]) / (bounds[1] - bounds[0]) * (HEIGHT - TOP - BOTTOM), 1)

@@ -6,7 +6,7 @@ from pathlib import Path
 from warpgs.files import write_text
 from warpgs.report.evaluated_run import groups, read_runs
 from warpgs.report.image_strips import saved_strips, saved_views
-from warpgs.report.page import Gallery, page, text, wide
+from warpgs.report.page import Gallery, TextTable, page
 from warpgs.report.write_report import extremes
 
 from .cells import Cell
@@ -36,17 +36,9 @@ def write_page(path: Path, title: str, tables: Sequence[Table], notes: Sequence[
         if worst:
             strips = [saved_strips(run, [*worst, *best], REASON) for run in chosen]
             galleries.append(Gallery(group, worst, best, strips))
-    write_text(path, page(runs, galleries, title=title, introduction=_introduction(tables, notes)))
+    write_text(path, page(runs, galleries, title, [_texts(table) for table in tables], notes))
 
 
-def _introduction(tables: Sequence[Table], notes: Sequence[str]) -> str:
-    return "".join(map(_table, tables)) + "".join(f"<p class=note>{text(note)}</p>" for note in notes)
-
-
-def _table(table: Table) -> str:
-    head = "".join(f"<th>{text(title)}</th>" for title in ("", *heads(table)))
-    rows = []
-    for row, cells in zip(table.rows, texts(table), strict=True):
-        values = "".join(f"<td{' class=best' if is_best else ''}>{text(value)}</td>" for value, is_best in cells)
-        rows.append(f"<tr><th>{text(row.label)}</th>{values}</tr>")
-    return f"<h2>{text(table.title)}</h2>{wide(f'<tr>{head}</tr>' + ''.join(rows))}"
+def _texts(table: Table) -> TextTable:
+    rows = zip((row.label for row in table.rows), texts(table), strict=True)
+    return TextTable(table.title, ("", *heads(table)), list(rows))
