@@ -131,6 +131,15 @@ def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, est
     assert [note.partition(":")[0] for note in notes] == (["the masks are estimates"] if distrusted else [])
 
 
+@pytest.mark.parametrize(("num", "rate"), [(8, 1e-4), (40, 5e-4), (80, 1e-3), (200, 1e-3)])
+def test_corrections_of_poses_are_slower_for_few_frames(num, rate):
+    cameras = {f"{k}": make_camera() for k in range(num)}
+    capture = Capture("shot", cameras, list(cameras), [], torch.zeros(0, 3), None, no_frame)
+    plan, notes = make_plan(plain.config(optim=plain.optim(poses=1e-3)), capture)
+    assert plan.optim.poses == pytest.approx(rate)
+    assert any(f"each of {num} frames" in note for note in notes) == (rate < 1e-3)
+
+
 def test_without_a_minimum_period_all_frequencies_are_used():
     assert determined_bands(ModelConfig(time_bands=10, min_period=0.0), 3) == 10
     assert determined_bands(ModelConfig(time_bands=0, min_period=4.0), 3) == 0

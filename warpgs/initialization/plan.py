@@ -10,6 +10,10 @@ from warpgs.data.capture import COLORS, Capture, background_color
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.runtime.devices import choose_device
 
+MANY_FRAMES = 80
+"""Number of training frames from which on corrections of poses have their whole rate. Cameras of fewer are each seen
+more often: at the rate of 80 frames those of 14 are led away from where their held-out neighbours are."""
+
 MAX_AVERAGED = 50
 """Maximum number of frames whose mean colour is the background."""
 
@@ -27,6 +31,10 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
     if bands < asked:
         notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} frames determine no more")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
+    poses = config.optim.poses * min(1.0, num / MANY_FRAMES)
+    if poses < config.optim.poses:
+        notes.append(f"corrections of poses learn at {poses:.1e}: each of {num} frames is seen often")
+        config = dataclasses.replace(config, optim=dataclasses.replace(config.optim, poses=poses))
     branches = loss.branches_in_stage2 != "no"
     if loss.branches_in_stage2 == "given-masks" and capture.assuming(config.assumption).uses_estimated_masks:
         notes.append("the masks are estimates: stage II compares the image of all Gaussians only, not each branch's")
