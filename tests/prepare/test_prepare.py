@@ -149,13 +149,14 @@ def test_depth_that_says_nothing_places_no_points():
 
 
 @pytest.mark.parametrize(
-    ("camera", "message"),
+    ("camera", "path", "message"),
     [
-        ("moving", r"in static regions: 0 features .* check the masks, in which 0 must mean dynamic"),
-        ("still", r"only 0 static points are left: nearly everything moves"),
+        ("moving", boards.pose, r"in static regions: 0 features .* check the masks, in which 0 must mean dynamic"),
+        ("still", boards.still_pose, r"only 0 static points are left: nearly everything moves"),
     ],
 )
-def test_masks_of_everything_are_refused_with_advice(shots, tmp_path, camera, message):
+def test_masks_of_everything_are_refused_with_advice(tmp_path, camera, path, message):
+    shots = boards.write_folder(tmp_path / "shots", boards.record(12, path=path)[0])
     (tmp_path / "masks").mkdir()
     for path in shots.iterdir():
         cv2.imwrite(str(tmp_path / "masks" / path.name), np.zeros(boards.SIZE[::-1], np.uint8))
@@ -163,13 +164,19 @@ def test_masks_of_everything_are_refused_with_advice(shots, tmp_path, camera, me
         prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"), camera=camera)
 
 
-def test_a_camera_that_does_not_stand_still_is_refused(shots, tmp_path, monkeypatch):
+def test_a_camera_that_does_not_stand_still_is_refused(shots, tmp_path):
+    with pytest.raises(ValueError, match=r"only \d% of the corners stay where they are: the camera is not still"):
+        prepare(shots, tmp_path / "made", camera="still")
+
+
+def test_a_camera_that_does_not_turn_on_the_spot_is_refused(shots, tmp_path, monkeypatch):
+    monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", turned_cameras)
     monkeypatch.setattr(
         "warpgs.prepare.masks.methods.find_dynamic", lambda f, *rest: [i[..., 0] < 256 for i in f.images]
     )
-    message = "100% of the pixels seem to move: the camera is not still; try another --camera"
+    message = "100% of the pixels seem to move: the camera is not turning; try another --camera"
     with pytest.raises(ValueError, match=message):
-        prepare(shots, tmp_path / "made", camera="still")
+        prepare(shots, tmp_path / "made", camera="turning")
 
 
 def test_cameras_misled_by_dynamic_objects_are_recovered_without_them(tmp_path):
@@ -235,7 +242,11 @@ def spoil_poses(path):
 
 DAMAGES = [
     ("frames/frames.json", lambda path: path.write_text("{}"), "frames"),
-    ("frames/frames.json", lambda path: path.write_text('{"width": 3, "height": 3, "frames": [1]}'), "TypeError|not"),
+    (
+        "frames/frames.json",
+        lambda path: path.write_text('{"width": 3, "height": 3, "frames": [1]}'),
+        "TypeError|not",
+    ),
     ("frames/frames.json", replace_by_fifo, "is not a file"),
     ("first-cameras.npz", lambda path: path.write_bytes(path.read_bytes()[:-200]), "zip"),
     ("first-cameras.npz", spoil_poses, "a finite pose of every frame"),
@@ -525,9 +536,7 @@ def test_cameras_of_the_first_pass_are_kept_if_masks_leave_too_little(error, sho
         return boards.true_cameras(folder, names)
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
-    monkeypatch.setattr(
-        "warpgs.prepare.masks.methods.find_dynamic", lambda f, *rest: [i[..., 0] > 255 for i in f.images]
-    )
+    monkeypatch.setattr("warpgs.prepare.masks.still.find_dynamic", lambda f, *rest: [i[..., 0] > 255 for i in f.images])
     if isinstance(error, NoCamerasError):
         notes = prepare(shots, tmp_path / "made", depth="none")["notes"]
         assert (

@@ -20,6 +20,7 @@ from .depth.estimate import add_depth, depth_files
 from .depth.methods import DEPTHS
 from .doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
 from .frames.images import read_images, resize_to_side
+from .frames.stillness import require_still
 from .frames.take import Frames, take_frames
 from .journal import Journal
 from .masks.background import SIDE, off_background
@@ -59,6 +60,8 @@ def take(source: Path, options: Options, journal: Journal) -> Frames:
             journal.require_space(MIN_SPACE)
             frames = take_frames(source, new, options.selection, journal.quiet, journal.notes)
             check_count(len(frames.taken), options)
+            if options.camera == "still":
+                require_still(new, frames.names)
             journal.require_space(frames.megabytes(CAPTURE_BYTES))
             journal.clear(keep=new)
             new.rename(path)

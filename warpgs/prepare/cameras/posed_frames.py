@@ -77,6 +77,11 @@ class PosedFrames:
         images = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self.images]
         return PosedFrames(images, self.lens.resized(*size), self.poses, self.points, self.focal)
 
+    @property
+    def stand_still(self) -> bool:
+        """Whether all frames have one pose."""
+        return bool((self.poses == self.poses[0]).all())
+
     def relative(self, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
         """Rotation and translation from the camera of a to that of b."""
         rotation = self.poses[b, :, :3] @ self.poses[a, :, :3].T
