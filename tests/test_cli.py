@@ -106,7 +106,7 @@ def test_help_shows_whether_a_switch_is_on_by_default(command, capsys):
 
 @pytest.mark.parametrize(
     ("command", "metavars"),
-    [("prepare", "SOURCE CAPTURE"), ("check", "CAPTURE"), ("eval", "RUN"), ("export", "RUN"), ("render", "RUN")],
+    [("prepare", "SOURCE"), ("check", "CAPTURE"), ("eval", "RUN"), ("export", "RUN"), ("render", "RUN")],
 )
 def test_positional_arguments_have_names(command, metavars, capsys):
     named = shown(capsys, command, "--help").partition("positional arguments")[2].partition("options")[0]

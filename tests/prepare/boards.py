@@ -179,7 +179,7 @@ def write_capture(root: Path, num_frames: int = 16, holdout: int = 0) -> Path:
     names = [path.stem for path in sorted((root / "frames").iterdir())]
     cameras = true_cameras(root, names)
     write_frames(root, root / "frames", cameras, masks)
-    write_scene(root, cameras, {name: k for k, name in enumerate(names)}, holdout)
+    write_scene(root, [cameras], cameras.points, {name: k for k, name in enumerate(names)}, holdout)
     return root
 
 

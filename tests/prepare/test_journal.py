@@ -10,7 +10,7 @@ from tests.prepare import boards
 from warpgs.captures.opening import load_capture
 from warpgs.prepare import pipeline, steps
 from warpgs.prepare.add import AddOptions, add_parts
-from warpgs.prepare.cameras.matches import has_features
+from warpgs.prepare.cameras.matches import has_features, sequence_pairs
 from warpgs.prepare.cameras.model import read_model
 from warpgs.prepare.options import Options
 
@@ -90,7 +90,7 @@ def test_what_a_killed_preparation_leaves_is_taken_over(shots, tmp_path, true_ca
 
 LOST = {
     "a frame": (".prepare/frames/frame_000004.png", "frames"),
-    "the index of the frames": (".prepare/frames/frames.json", "frames"),
+    "the index of the frames": (".prepare/frames/index_frame.json", "frames"),
     "a mask": (".prepare/masks/frame_000004.png.png", "masks"),
     "the cameras": (".prepare/cameras.npz", "cameras"),
     "an image": ("rgb/2x/frame_000004.png", "capture"),
@@ -178,11 +178,12 @@ SPOILT = {
 def test_features_count_as_found_only_if_the_database_has_them(matched, tmp_path, spoil):
     path = shutil.copy(matched / ".prepare/colmap/features.db", tmp_path)
     files = [f"frame_{k:06d}.png" for k in range(COUNT)]
-    assert has_features(Path(path), files)
-    assert has_features(Path(path), files[2:5])
-    assert not has_features(Path(path), [*files, "frame_000099.png"])
+    count = len(sequence_pairs(COUNT))
+    assert has_features(Path(path), files, count)
+    assert has_features(Path(path), files[2:5], count)
+    assert not has_features(Path(path), [*files, "frame_000099.png"], count)
     spoil(Path(path))
-    assert not has_features(Path(path), files)
+    assert not has_features(Path(path), files, count)
 
 
 def test_a_folder_whose_features_another_preparation_removed_recovers(matched, shots, tmp_path):

@@ -241,13 +241,13 @@ def spoil_poses(path):
 
 
 DAMAGES = [
-    ("frames/frames.json", lambda path: path.write_text("{}"), "frames"),
+    ("frames/index_frame.json", lambda path: path.write_text("{}"), "frames"),
     (
-        "frames/frames.json",
+        "frames/index_frame.json",
         lambda path: path.write_text('{"width": 3, "height": 3, "frames": [1]}'),
         "TypeError|not",
     ),
-    ("frames/frames.json", replace_by_fifo, "is not a file"),
+    ("frames/index_frame.json", replace_by_fifo, "is not a file"),
     ("first-cameras.npz", lambda path: path.write_bytes(path.read_bytes()[:-200]), "zip"),
     ("first-cameras.npz", spoil_poses, "a finite pose of every frame"),
     ("first-cameras.npz", replace_by_fifo, "is not a file"),

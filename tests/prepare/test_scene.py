@@ -11,7 +11,7 @@ from warpgs.captures.opening import load_capture
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import recognize
 from warpgs.prepare.cameras.recovered import Cameras
-from warpgs.prepare.scene import scene_units, static_points, write_frames, write_scene
+from warpgs.prepare.scene import are_static, scene_units, write_frames, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_frames_and_masks_are_written_as_they_were_recorded_with_their_lens(mode
     cameras = boards.true_cameras(frames, names)
     lens = dataclasses.replace(cameras.lens, coefficients=(0.05, -0.01), model=model)
     write_frames(tmp_path / "made", frames, dataclasses.replace(cameras, lens=lens), masks)
-    write_scene(tmp_path / "made", cameras, {name: k for k, name in enumerate(names)}, 4)
+    write_scene(tmp_path / "made", [cameras], cameras.points, {name: k for k, name in enumerate(names)}, 4)
     frame = load_capture(tmp_path / "made").frame(names[3])
     assert np.array_equal(frame.image.numpy(), images[3])
     assert np.array_equal(~frame.static_mask.numpy(), masks[3])
@@ -94,7 +94,7 @@ def test_points_in_dynamic_regions_are_omitted():
     cameras = Cameras(list("abcd"), boards.lens(), poses, points, 0.1, 9.0)
     dynamic = np.zeros((4, 192, 256), bool)
     dynamic[:3, 90:100, 120:136] = True
-    assert static_points(cameras, list(dynamic)).tolist() == [False, True, True]
+    assert are_static(points, [(cameras, list(dynamic))]).tolist() == [False, True, True]
 
 
 def test_cameras_are_saved_and_loaded(tmp_path):

@@ -21,7 +21,7 @@ FIRST = Cameras(NAMES, Lens.centered(500.0, (64, 48)), np.tile(np.eye(4)[:3], (1
 @pytest.fixture
 def steps(tmp_path):
     frames = Frames(tmp_path, [SourceFrame(name, f"{name}.jpg", k, k) for k, name in enumerate(NAMES)], 64, 48, 1.0)
-    return Steps(frames, Options(), Journal(tmp_path / "made", {}, force=False, log=None))
+    return Steps([frames], Options(), Journal(tmp_path / "made", {}, force=False, log=None))
 
 
 def with_frames(count):
@@ -31,7 +31,7 @@ def with_frames(count):
 @pytest.mark.parametrize(("kept", "used"), [(10, 10), (8, 8), (7, 10)])
 def test_a_second_pass_is_used_unless_it_omits_many_frames(steps, monkeypatch, kept, used):
     monkeypatch.setattr(module, "recover_cameras", lambda *job: with_frames(kept))
-    assert len(steps.refine("cameras", FIRST, Masks()).names) == used
+    assert len(steps.refine("cameras", [FIRST], Masks())[0].names) == used
     reason = f"only {kept} of 10 frames have a camera"
     assert [note.endswith(reason) for note in steps.journal.notes] == [True] * (used != kept)
 
@@ -40,7 +40,7 @@ def test_a_second_pass_is_used_unless_it_omits_many_frames(steps, monkeypatch, k
 def test_half_of_all_frames_need_a_camera_even_if_some_were_omitted_before(steps, monkeypatch, found):
     monkeypatch.setattr(module, "recover_cameras", lambda *job: with_frames(found))
     if found == 5:
-        assert len(steps.recover("cameras", NAMES[:7]).names) == 5
+        assert len(steps.recover("cameras", [NAMES[:7]])[0].names) == 5
         return
     with pytest.raises(NoCamerasError, match=r"found for only 4 of 10 frames"):
-        steps.recover("cameras", NAMES[:7])
+        steps.recover("cameras", [NAMES[:7]])

@@ -162,8 +162,8 @@ class _Job:
                 lens = self._lens(name)
                 dynamic = _resampled(mask.astype(np.float32), frames.lens, lens, cv2.INTER_LINEAR) > 0.5
                 writer.write_mask(self.root, name, ~dynamic, self._factors())
-        shown = {k: overlay_mask(frames.images[k], masks[k]) for k in choose_evenly(len(names))}
-        write_contact_sheet(self.root / "masks.png", shown, names)
+        shown = {names[k]: overlay_mask(frames.images[k], masks[k]) for k in choose_evenly(len(names))}
+        write_contact_sheet(self.root / "masks.png", [shown])
         fraction = float(np.mean([mask.mean() for mask in masks]))
         self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
 
@@ -221,8 +221,8 @@ class _Job:
                 lens = self._lens(name)
                 lens = lens.resized(frames.lens.width, round(frames.lens.width * lens.height / lens.width))
                 writer.write_depth(self.root, name, as_half(_resampled(plane, frames.lens, lens, cv2.INTER_NEAREST)))
-        shown = {k: colored_depth(planes[k]) for k in choose_evenly(len(names))}
-        write_contact_sheet(self.root / "depth.png", shown, names)
+        shown = {names[k]: colored_depth(planes[k]) for k in choose_evenly(len(names))}
+        write_contact_sheet(self.root / "depth.png", [shown])
         known = float(np.mean([np.isfinite(plane).mean() for plane in planes]))
         self._say(f"depth: {len(missing)} frames, known on {known:.0%} of the pixels: look at depth.png")
 

@@ -1,6 +1,7 @@
 """Checks of the options before a preparation starts, and of the number of frames once they are taken."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 from warpgs.data.loaders import is_capture
@@ -9,7 +10,8 @@ from warpgs.errors import command, not_one_of, similar_path, suggestion
 
 from .cameras.intrinsics import read_intrinsics
 from .depth.methods import DEPTHS
-from .frames.take import check_selection
+from .frames.offsets import check_offsets
+from .frames.take import Frames, check_selection
 from .masks.methods import MASKERS
 from .options import Options
 from .weights import find_weights
@@ -18,14 +20,17 @@ MIN_FOR_MOTION = 10
 """Minimum number of frames to find what moves; with fewer, some lack three far frames (``revisits``)."""
 
 
-def check_options(source: Path, root: Path, options: Options) -> None:
-    """Checks the options, that the source is no capture, and that the capture's folder does not contain what is read.
+def check_options(sources: Sequence[Path], root: Path, options: Options) -> None:
+    """Checks the options, that no source is a capture, and that the capture's folder does not contain what is read.
 
     Raises:
         ValueError: If a value is invalid, the source is a capture, or a folder or the weights of a network are missing.
         ImportError: If the package of a network is missing.
     """
     check_selection(options.selection)
+    check_offsets(options.offsets, len(sources))
+    if len(sources) > 1:
+        _check_several(sources, options)
     if options.focal is not None and not 0.0 < options.focal < math.inf:
         raise ValueError(f"--focal must be positive, got {options.focal}")
     if options.intrinsics is not None:
@@ -50,18 +55,32 @@ def check_options(source: Path, root: Path, options: Options) -> None:
             "anything (a network) or none"
         )
     _check_networks(options)
-    _check_paths(source, root, options)
+    _check_paths(sources, root, options)
 
 
-def _check_paths(source: Path, root: Path, options: Options) -> None:
+def _check_several(sources: Sequence[Path], options: Options) -> None:
+    if options.camera != "moving":
+        raise ValueError(f"--camera {options.camera} is for one video: of several, each may move or stand still")
+    seen: set[Path] = set()
+    for source in sources:
+        if source.is_dir():
+            raise ValueError(f"{source} is a folder: several sources must be videos, whose times are known")
+        if not source.exists():
+            raise ValueError(f"{source} is missing: expected a video{similar_path(source)}")
+        if source.resolve() in seen:
+            raise ValueError(f"{source} is given twice")
+        seen.add(source.resolve())
+
+
+def _check_paths(sources: Sequence[Path], root: Path, options: Options) -> None:
     if root.exists() and not root.is_dir():
         raise ValueError(f"{root} is a file: choose another folder")
-    if source.is_dir() and is_capture(source):
+    if is_capture(sources[0]):
         raise ValueError(
-            f"{source} is a capture: {command('train', '--data', source)} trains on it; prepare needs a video or a "
-            "folder of images alone"
+            f"{sources[0]} is a capture: {command('train', '--data', sources[0])} trains on it; prepare needs a video "
+            "or a folder of images alone"
         )
-    inputs = [("source", source)]
+    inputs = [("source", source) for source in sources]
     inputs += [("masks", Path(options.masks))] if options.masks not in MASKERS else []
     inputs += [("intrinsics", options.intrinsics)] if options.intrinsics is not None else []
     inputs += [("weights", options.weights)] if options.weights is not None else []
@@ -80,15 +99,21 @@ def _check_networks(options: Options) -> None:
         find_weights(network, options.weights)
 
 
-def check_count(count: int, options: Options) -> None:
-    """Checks that the options are possible with this number of frames.
+def check_frames(videos: Sequence[Frames], options: Options) -> None:
+    """Checks that the options are possible with the frames of some videos.
 
     Raises:
-        ValueError: If there are too few frames.
+        ValueError: If one has too few frames, or several of other sizes have one lens.
     """
-    if MASKERS.get(options.masks) is not None and count < MIN_FOR_MOTION:
-        raise ValueError(
-            f"{count} frames are too few to find what moves, at least {MIN_FOR_MOTION} are needed: take more "
-            "(--fps, --count), or give masks of what moves (--masks FOLDER, --masks none if nothing does)"
-        )
-    held_out([""] * count, options.holdout)
+    if len({(video.width, video.height, video.factor) for video in videos}) > 1 and (
+        options.focal is not None or options.intrinsics is not None
+    ):
+        raise ValueError("--focal and --intrinsics are of all videos, which have several sizes: omit them")
+    for video in videos:
+        count, whose = len(video.taken), f" of {video.source}" if len(videos) > 1 else ""
+        if MASKERS.get(options.masks) is not None and count < MIN_FOR_MOTION:
+            raise ValueError(
+                f"{count} frames{whose} are too few to find what moves, at least {MIN_FOR_MOTION} are needed: take "
+                "more (--fps, --count), or give masks of what moves (--masks FOLDER, --masks none if nothing does)"
+            )
+        held_out([""] * count, options.holdout)

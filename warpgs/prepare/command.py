@@ -5,7 +5,7 @@ from warpgs.errors import command, ending_at_once, terminable
 
 from .options import Prepare, Sample
 
-USED_BY_ADD = ("source", "add", "options", "masks", "depth", "weights", "quiet")
+USED_BY_ADD = ("paths", "add", "options", "masks", "depth", "weights", "quiet")
 """Options that mean something with ``--add``."""
 
 
@@ -17,24 +17,26 @@ def run_prepare(options: Prepare) -> None:
             from .add import AddOptions, add_parts
         _check_alone(options)
         how = options.options
-        add_parts(options.source, AddOptions(options.add.split(","), how.masks, how.depth or "flow", how.weights), log)
+        add_parts(
+            options.paths[0], AddOptions(options.add.split(","), how.masks, how.depth or "flow", how.weights), log
+        )
         return
-    if options.capture is None:
+    if len(options.paths) < 2:
         raise ValueError("prepare needs a source and a folder for the capture, or a capture and --add")
     with ending_at_once():
         from .pipeline import prepare  # imports OpenCV, SciPy and COLMAP
     try:
         with terminable():
-            prepare(options.source, options.capture, options.options, force=options.force, log=log)
+            prepare(options.paths[:-1], options.paths[-1], options.options, force=options.force, log=log)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("interrupted; run the same command again to continue") from None
 
 
 def _check_alone(options: Prepare) -> None:
     """Refuses what --add has no use for."""
-    if options.capture is not None:
-        raise ValueError(f"with --add, give the capture only, without {options.capture}")
-    plain = Prepare(options.source)
+    if len(options.paths) != 1:
+        raise ValueError(f"with --add, give the capture only, got {', '.join(map(str, options.paths)) or 'nothing'}")
+    plain = Prepare(options.paths)
     for given, default in (
         (options.options.selection, plain.options.selection),
         (options.options, plain.options),

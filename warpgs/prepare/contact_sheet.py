@@ -16,21 +16,28 @@ COLUMNS = 6
 THUMBNAIL_WIDTH = 256
 
 
-def write_contact_sheet(path: Path, images: Mapping[int, UInt8[np.ndarray, "H W 3"]], names: Sequence[str]) -> None:
-    """Writes images by index as thumbnails, captioned by the name of that index, six in a row.
+def write_contact_sheet(path: Path, cameras: Sequence[Mapping[str, UInt8[np.ndarray, "H W 3"]]]) -> None:
+    """Writes images as thumbnails, captioned by their names, six in a row; each camera begins a row.
+
+    Args:
+        path: File to write.
+        cameras: [H, W, 3] images of each camera, by name.
 
     Raises:
         OSError: If the file cannot be written; the message names it.
     """
-    thumbnails = [_thumbnail(image, names[k]) for k, image in images.items()]
-    columns = min(COLUMNS, len(thumbnails))
-    thumbnails += [np.zeros_like(thumbnails[0])] * (-len(thumbnails) % columns)
-    write_png(path, np.vstack([np.hstack(thumbnails[k : k + columns]) for k in range(0, len(thumbnails), columns)]))
+    columns, rows = min(COLUMNS, max(map(len, cameras))), []
+    for images in cameras:
+        thumbnails = [_thumbnail(image, name) for name, image in images.items()]
+        thumbnails += [np.zeros_like(thumbnails[0])] * (-len(thumbnails) % columns)
+        rows += [np.hstack(thumbnails[k : k + columns]) for k in range(0, len(thumbnails), columns)]
+    write_png(path, np.vstack(rows))
 
 
-def choose_evenly(count: int) -> list[int]:
-    """At most 30 indices, evenly spaced over ``count``."""
-    return evenly_spaced_indices(count, MAX_THUMBNAILS)
+def choose_evenly(count: int, num_cameras: int = 1) -> list[int]:
+    """Indices of one camera's thumbnails, evenly spaced over ``count``: 30 of all cameras, but at least one row."""
+    rows = max(1, MAX_THUMBNAILS // (COLUMNS * num_cameras))
+    return evenly_spaced_indices(count, rows * COLUMNS)
 
 
 def overlay_mask(image: UInt8[np.ndarray, "H W 3"], dynamic: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:

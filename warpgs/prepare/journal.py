@@ -19,10 +19,10 @@ OUTPUTS = (
 )  # fmt: skip
 """Everything that prepare writes into the capture's folder, apart from the work folder."""
 
-FRAME = re.compile(r"frame_\d{6}\.(png|png\.png|npy|json)(\.partial)?")
+FRAME = re.compile(r"(frame|\d+)_\d{6}\.(png|png\.png|npy|json)(\.partial)?")
 """Names of the files in these folders, also of those that were being written at an interruption."""
 
-VERSION = 6
+VERSION = 7
 """Version of the intermediate files; an unfinished preparation of another version starts afresh."""
 
 ADVICE = "free some disk space and run the same command again"

@@ -24,11 +24,11 @@ class Selection:
     fps: float | None = None
     """Frames per second to take from a video; the sharpest frame of each interval is taken."""
     count: int | None = None
-    """Number of frames to take; by default all frames of a folder and 150 of a video."""
+    """Number of frames to take of each source; by default all frames of a folder and 150 of a video."""
     longest_side: int = 960
     """Larger frames are scaled down to this [px]."""
     start: float = 0.0
-    """Take frames from this time of a video on [s]."""
+    """Take frames from this time of a video on [s]; of several, of the time that all of them show."""
     end: float | None = None
     """Take frames up to this time of a video [s]."""
 
@@ -45,7 +45,8 @@ class Options:
     intrinsics: Path | None = None
     """File of the known lens: COLMAP's cameras.txt, or JSON, YAML or XML of OpenCV; instead of --lens and --focal."""
     camera: CameraMotion = "moving"
-    """moving, turning (on the spot) or still (on a tripod). The last two give no depth, and no views from elsewhere."""
+    """moving, turning (on the spot) or still (on a tripod). The last two give no depth, and no views from elsewhere. Of
+    several cameras, each may move or stand still."""
     masks: str = "motion"
     """How to find what moves: motion, sam2 (motion refined by a network), none, or a folder of masks (0 = dynamic)
     named like the source's files or like the capture's frames."""
@@ -53,9 +54,24 @@ class Options:
     """How to estimate depth: flow (static surfaces, by optical flow; the default of a moving camera), anything (all
     pixels, by a network) or none."""
     holdout: int = 0
-    """Keep every N-th frame for evaluation (val_ids); 0 keeps none."""
+    """Keep every N-th frame of each camera for evaluation (val_ids); 0 keeps none."""
     weights: Path | None = None
     """Folder with the networks' weights; by default the Hugging Face cache. Nothing is downloaded."""
+    offset: str | None = None
+    """When each of several videos starts [s], in their order and separated by commas, such as 0,0.37,1.2; found from
+    their sound by default."""
+
+    @property
+    def offsets(self) -> list[float] | None:
+        """The numbers of ``offset``.
+
+        Raises:
+            ValueError: If they are no numbers.
+        """
+        try:
+            return None if self.offset is None else [float(part) for part in self.offset.split(",")]
+        except ValueError:
+            raise ValueError(f"--offset must be numbers of seconds, separated by commas, got {self.offset}") from None
 
     @property
     def depth_method(self) -> str:
@@ -65,16 +81,15 @@ class Options:
 
 @dataclass(frozen=True)
 class Prepare:
-    """Makes a capture in the NeRF-DS layout from a video or a folder of frames in temporal order.
+    """Makes a capture in the NeRF-DS layout from a video, a folder of frames in temporal order, or videos of one event.
 
     After an interruption or an error, the same command continues with the first unfinished step. With ``--add``, adds
     what a capture lacks, with its own cameras: ``warpgs prepare CAPTURE --add masks,depth,points``.
     """
 
-    source: Annotated[Path, tyro.conf.arg(metavar="SOURCE"), tyro.conf.Positional]
-    """Video, or folder of PNG or JPEG frames of one size; with --add the capture."""
-    capture: Annotated[Path | None, tyro.conf.arg(metavar="CAPTURE"), tyro.conf.Positional] = None
-    """Folder to write the capture to; not with --add."""
+    paths: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="SOURCE [VIDEOS] CAPTURE"), tyro.conf.Positional]
+    """Video, or folder of PNG or JPEG frames of one size, or several videos, each of a camera of its own; then the
+    folder to write the capture to. With --add the capture alone."""
     add: str | None = None
     """Add these to a capture that lacks them: masks, depth and points, separated by commas."""
     options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)

@@ -1,18 +1,17 @@
 """Writes frames, masks and cameras as a capture in the NeRF-DS layout, in scene units around the static points."""
 
-import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from warpgs.captures.findings import few_of
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.units import depth_range, scene_units
 
-from .cameras.recovered import Cameras
+from .cameras.recovered import Cameras, camera_centers
 from .cameras.sphere import points_around
 from .contact_sheet import choose_evenly, overlay_mask, write_contact_sheet
 from .frames.images import brighten, read_images
@@ -29,6 +28,8 @@ MAX_DYNAMIC_VIEWS = 0.5
 
 MIN_STATIC_POINTS = 50
 
+Masks = Sequence[Bool[np.ndarray, "H W"]]
+
 NO_PARALLAX = (
     "the camera stays at one place: nothing tells how far away surfaces are, so the points lie on a sphere around it "
     "(unless a network estimates depth), and views from elsewhere are guesses"
@@ -37,9 +38,9 @@ NO_PARALLAX = (
 
 def write_capture(
     root: Path,
-    frames: Frames,
-    cameras: Cameras,
-    dynamic: Sequence[Bool[np.ndarray, "H W"]],
+    videos: Sequence[Frames],
+    cameras: Sequence[Cameras],
+    masks: Callable[[Cameras], Masks],
     *,
     estimated: bool,
     holdout: int,
@@ -49,9 +50,9 @@ def write_capture(
 
     Args:
         root: Folder of the capture.
-        frames: All frames that were taken.
-        cameras: Cameras of the registered frames.
-        dynamic: [H, W] dynamic mask of each frame of the cameras.
+        videos: All frames that were taken, of each camera.
+        cameras: The frames of each camera that were registered.
+        masks: Gives the [H, W] dynamic mask of each frame of a camera.
         estimated: Whether the masks are estimates.
         holdout: Every N-th frame is for evaluation; 0 for none.
         quiet: Whether to show no progress.
@@ -60,17 +61,35 @@ def write_capture(
         ValueError: If too few static points remain, or no frame for evaluation.
         OSError: If a file cannot be written; the message names it.
     """
-    notes = [] if cameras.have_parallax else [NO_PARALLAX]
-    cameras = _with_static_points(cameras, dynamic)
-    writer.held_out(cameras.names, holdout)  # fails before anything is written
-    omitted = [f"{frame.name} ({frame.source})" for frame in frames.taken if frame.name not in cameras.names]
-    if omitted:
+    notes = [NO_PARALLAX] if len(cameras) == 1 and not cameras[0].have_parallax else []
+    points = _static_points(cameras, masks)
+    for camera in cameras:
+        writer.held_out(camera.names, holdout)  # fails before anything is written
+    if omitted := _omitted(videos, cameras):
         notes.append(f"omitted, because no camera was found for them: {few_of(omitted)}")
-    shown = write_frames(root, frames.folder, cameras, dynamic, choose_evenly(len(dynamic)), quiet)
-    write_scene(root, cameras, {frame.name: frame.time for frame in frames.taken}, holdout, estimated)
-    painted = {k: overlay_mask(image, dynamic[k]) for k, image in zip(shown, brighten([*shown.values()]), strict=True)}
-    write_contact_sheet(root / "masks.png", painted, cameras.names)
-    return f"{len(dynamic)} frames, {len(omitted)} omitted, {len(cameras.points)} static points", notes
+    sheets = []
+    for camera in cameras:
+        dynamic, chosen = masks(camera), choose_evenly(len(camera.names), len(cameras))
+        shown = write_frames(root, videos[0].folder, camera, dynamic, chosen, quiet)
+        sheets.append(_painted(camera.names, shown, dynamic))
+    times = {frame.name: frame.time for video in videos for frame in video.taken}
+    write_scene(root, cameras, points, times, holdout, estimated)
+    write_contact_sheet(root / "masks.png", sheets)
+    return f"{len(times) - len(omitted)} frames, {len(omitted)} omitted, {len(points)} static points", notes
+
+
+def _omitted(videos: Sequence[Frames], cameras: Sequence[Cameras]) -> list[str]:
+    """The frames without a camera, and where they are from."""
+    placed = {name for camera in cameras for name in camera.names}
+    return [f"{frame.name} ({frame.source})" for video in videos for frame in video.taken if frame.name not in placed]
+
+
+def _painted(
+    names: Sequence[str], shown: dict[int, UInt8[np.ndarray, "H W 3"]], dynamic: Masks
+) -> dict[str, UInt8[np.ndarray, "H W 3"]]:
+    """Images by index with their masks, by name."""
+    bright = zip(shown, brighten([*shown.values()]), strict=True)
+    return {names[k]: overlay_mask(image, dynamic[k]) for k, image in bright}
 
 
 def capture_files(root: Path, names: Sequence[str]) -> list[Path]:
@@ -80,37 +99,44 @@ def capture_files(root: Path, names: Sequence[str]) -> list[Path]:
     return [root / "dataset.json", root / "metadata.json", root / "scene.json", root / "points.npy", *frames]
 
 
-def _with_static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Cameras:
-    if cameras.have_parallax:
-        points = cameras.points[static_points(cameras, dynamic)]
+def _static_points(cameras: Sequence[Cameras], masks: Callable[[Cameras], Masks]) -> Float[np.ndarray, "P 3"]:
+    if len(cameras) > 1:
+        points = np.unique(np.concatenate([camera.points for camera in cameras]), axis=0)
+    elif cameras[0].have_parallax:
+        points = cameras[0].points
     else:
-        points = points_around(cameras, dynamic)
+        return _enough(points_around(cameras[0], masks(cameras[0])))
+    return _enough(points[are_static(points, ((camera, masks(camera)) for camera in cameras))])
+
+
+def _enough(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
     if len(points) < MIN_STATIC_POINTS:
         raise ValueError(
             f"only {len(points)} static points are left: nearly everything moves, or the masks are inverted "
             "(0 = dynamic)"
         )
-    return dataclasses.replace(cameras, points=points)
+    return points
 
 
-def static_points(cameras: Cameras, dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> Bool[np.ndarray, " P"]:
+def are_static(points: Float[np.ndarray, "P 3"], cameras: Iterable[tuple[Cameras, Masks]]) -> Bool[np.ndarray, " P"]:
     """[P] whether at least half of the frames that see a point see it in a static region.
 
     Args:
-        cameras: Cameras with points.
-        dynamic: [H, W] dynamic mask of each camera, in the size of the lens.
+        points: [P, 3] in the world.
+        cameras: The frames of each camera, and their [H, W] dynamic masks, in the size of the lens.
     """
-    lens, points = cameras.lens, cameras.points
     hits, views = np.zeros(len(points)), np.zeros(len(points))
-    for pose, mask in zip(cameras.poses, dynamic, strict=True):
-        in_camera = points @ pose[:, :3].T + pose[:, 3]
-        front = in_camera[:, 2] > 0
-        depth = np.where(front, in_camera[:, 2], 1.0)
-        position = lens.image(in_camera[:, 0] / depth, in_camera[:, 1] / depth)
-        column, row = np.floor(position).clip(-1, 1e6).astype(int)
-        visible = front & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
-        views += visible
-        hits[visible] += mask[row[visible], column[visible]]
+    for camera, dynamic in cameras:
+        lens = camera.lens
+        for pose, mask in zip(camera.poses, dynamic, strict=True):
+            in_camera = points @ pose[:, :3].T + pose[:, 3]
+            front = in_camera[:, 2] > 0
+            depth = np.where(front, in_camera[:, 2], 1.0)
+            position = lens.image(in_camera[:, 0] / depth, in_camera[:, 1] / depth)
+            column, row = np.floor(position).clip(-1, 1e6).astype(int)
+            visible = front & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
+            views += visible
+            hits[visible] += mask[row[visible], column[visible]]
     return hits <= MAX_DYNAMIC_VIEWS * np.maximum(views, 1)
 
 
@@ -152,33 +178,45 @@ def write_frames(
 
 
 def write_scene(
-    root: Path, cameras: Cameras, times: dict[str, int], holdout: int, estimated_masks: bool = False
+    root: Path,
+    cameras: Sequence[Cameras],
+    points: Float[np.ndarray, "P 3"],
+    times: dict[str, int],
+    holdout: int,
+    estimated_masks: bool = False,
 ) -> None:
     """Writes points.npy, scene.json, metadata.json, and finally dataset.json, which makes the folder a capture.
 
     Args:
         root: Folder of the capture.
-        cameras: Cameras with static points only.
+        cameras: The frames of each camera.
+        points: [P, 3] static points in the world.
         times: Time of each frame, see ``SourceFrame``.
-        holdout: Every N-th frame is for evaluation; 0 for none.
+        holdout: Every N-th frame of each camera is for evaluation; 0 for none.
         estimated_masks: Whether the masks are estimates.
 
     Raises:
         OSError: If a file cannot be written; the message names it.
     """
-    write_world(root, cameras)
-    first = times[cameras.names[0]]
-    time_ids = {name: times[name] - first for name in cameras.names}
-    val = writer.held_out(cameras.names, holdout)
-    writer.write_index(root, time_ids, val, estimated_masks=estimated_masks)
+    write_world(root, points, np.concatenate([camera.poses for camera in cameras]))
+    first = min(times[camera.names[0]] for camera in cameras)
+    time_ids = {name: times[name] - first for camera in cameras for name in camera.names}
+    camera_ids = {name: k for k, camera in enumerate(cameras) for name in camera.names}
+    val = {name for camera in cameras for name in writer.held_out(camera.names, holdout)}
+    writer.write_index(root, time_ids, val, camera_ids, estimated_masks=estimated_masks)
 
 
-def write_world(root: Path, cameras: Cameras) -> None:
+def write_world(root: Path, points: Float[np.ndarray, "P 3"], poses: Float[np.ndarray, "F 3 4"]) -> None:
     """Writes points.npy, and scene.json with the units around them.
+
+    Args:
+        root: Folder of the capture.
+        points: [P, 3] static points in the world.
+        poses: [F, 3, 4] world to camera, of all frames.
 
     Raises:
         OSError: If a file cannot be written; the message names it.
     """
-    units, poses = scene_units(cameras.points, cameras.centers), cameras.poses
-    depths = np.concatenate([cameras.points @ p[2, :3] + p[2, 3] for p in poses[:: max(1, len(poses) // 20)]])
-    writer.write_scene(root, units, cameras.points, *depth_range(depths * units.scale))
+    units = scene_units(points, camera_centers(poses))
+    depths = np.concatenate([points @ p[2, :3] + p[2, 3] for p in poses[:: max(1, len(poses) // 20)]])
+    writer.write_scene(root, units, points, *depth_range(depths * units.scale))

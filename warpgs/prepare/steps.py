@@ -13,15 +13,24 @@ from warpgs.data.lens import Lens
 
 from .cameras.intrinsics import read_intrinsics
 from .cameras.posed_frames import load_posed_frames
-from .cameras.recovered import Cameras, NoCamerasError, require_frames
-from .cameras.sfm import Settings, recover_cameras
-from .checks import check_count
+from .cameras.recovered import (
+    Cameras,
+    NoCamerasError,
+    files_of_all,
+    load_all,
+    require_cameras,
+    require_frames,
+    save_all,
+)
+from .cameras.sfm import Settings, Shots, recover_cameras, recover_several
+from .checks import check_frames
 from .depth.estimate import add_depth, depth_files
 from .depth.methods import DEPTHS
 from .doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
 from .frames.images import read_images, resize_to_side
+from .frames.offsets import common_clock
 from .frames.stillness import require_still
-from .frames.take import Frames, take_frames
+from .frames.take import Frames, take_frames, take_videos
 from .journal import Journal
 from .masks.background import SIDE, off_background
 from .masks.files import Masks, mask_files, write_masks
@@ -50,84 +59,120 @@ STILL_FOCAL = 1.0
 """Focal length over the longer side of a camera on a tripod whose focal length is unknown: 53° across."""
 
 
-def take(source: Path, options: Options, journal: Journal) -> Frames:
-    """The selected frames of the source; a capture that is being replaced stays complete until they are all taken."""
+Names = list[list[str]]
+"""Names of the frames of each camera."""
+
+
+def names_of(cameras: Sequence[Cameras]) -> Names:
+    """The names of each camera's frames."""
+    return [camera.names for camera in cameras]
+
+
+def take(sources: Sequence[Path], options: Options, journal: Journal) -> list[Frames]:
+    """The selected frames of each source; a capture that is being replaced stays complete until they are all taken."""
 
     def make(path: Path) -> str:
         new = journal.work / "new"
         shutil.rmtree(new, ignore_errors=True)
         try:
             journal.require_space(MIN_SPACE)
-            frames = take_frames(source, new, options.selection, journal.quiet, journal.notes)
-            check_count(len(frames.taken), options)
-            if options.camera == "still":
-                require_still(new, frames.names)
-            journal.require_space(frames.megabytes(CAPTURE_BYTES))
+            videos, summary = _take(sources, new, options, journal)
+            check_frames(videos, options)
+            journal.require_space(sum(video.megabytes(CAPTURE_BYTES) for video in videos))
             journal.clear(keep=new)
             new.rename(path)
         finally:
             shutil.rmtree(new, ignore_errors=True)
-        return f"{len(frames.taken)} of {frames.width}×{frames.height}"
+        return summary
 
-    return journal.result("frames", Frames.load, make, Frames.files)
+    return journal.result("frames", Frames.load_all, make, Frames.files)
+
+
+def _take(sources: Sequence[Path], folder: Path, options: Options, journal: Journal) -> tuple[list[Frames], str]:
+    """Writes the frames to a folder; returns them and a summary."""
+    if len(sources) == 1:
+        video = take_frames(sources[0], folder, options.selection, journal.quiet, journal.notes)
+        if options.camera == "still":
+            require_still(folder, video.names)
+        return [video], f"{len(video.taken)} of {video.width}×{video.height}"
+    clock, starts = common_clock(sources, options.offsets, journal.quiet)
+    videos = take_videos(sources, folder, options.selection, clock, journal.quiet, journal.notes)
+    taken = [
+        f"{len(video.taken)} of {video.width}×{video.height} of {video.prefix}, "
+        f"{'which stands still' if video.is_still else 'which moves'}"
+        for video in videos
+    ]
+    return videos, f"{'; '.join(taken)}; {starts}"
 
 
 @dataclass(frozen=True)
 class Steps:
     """The steps after the frames are taken."""
 
-    frames: Frames
+    videos: list[Frames]
     options: Options
     journal: Journal
+
+    @property
+    def names(self) -> Names:
+        """The names of each video's frames."""
+        return [video.names for video in self.videos]
 
     def recover(
         self,
         name: str,
-        names: list[str],
+        names: Names,
         masks: Masks | None = None,
         *,
         thorough: bool = True,
         weak_features: bool = False,
-    ) -> Cameras:
+    ) -> list[Cameras]:
         """The cameras of the named frames, from features outside of the masks."""
         folder = masks.folder if masks else None
         settings = replace(self._settings, masks=folder, thorough=thorough, weak_features=weak_features)
 
         def make(path: Path) -> str:
             if self.options.camera == "still":
-                return _save(self._still(names), path, names)
+                return _save([self._still(names[0])], path, names)
             return _save(self._reconstruct(names, settings), path, names)
 
-        return self.journal.result(name, Cameras.load, make, Cameras.files)
+        return self._cameras(name, make)
 
-    def refine(self, name: str, first: Cameras, masks: Masks) -> Cameras:
+    def _cameras(self, name: str, make: Callable[[Path], str]) -> list[Cameras]:
+        count = len(self.videos)
+        return self.journal.result(name, partial(load_all, count=count), make, partial(files_of_all, count=count))
+
+    def refine(self, name: str, first: list[Cameras], masks: Masks) -> list[Cameras]:
         """The cameras of the first pass, refined with the matches outside of the masks."""
-        settings = replace(self._settings, masks=masks.folder, weak_features=first.weak_features, refine=True)
-        if first.has_held_focal:
-            settings = replace(settings, focal=first.lens.focal[0])
+        settings = replace(self._settings, masks=masks.folder, weak_features=first[0].weak_features, refine=True)
+        if first[0].has_held_focal:
+            settings = replace(settings, focal=first[0].lens.focal[0])
 
         def make(path: Path) -> str:
             if self.options.camera == "still":
-                return _save(first, path, first.names)
+                return _save(first, path, names_of(first))
             try:
-                found = self._reconstruct(first.names, settings)
-                if len(found.names) >= MIN_KEPT * len(first.names):
-                    return _save(replace(found, has_held_focal=first.has_held_focal), path, first.names)
-                reason = f"only {len(found.names)} of {len(first.names)} frames have a camera"
+                found = self._reconstruct(names_of(first), settings)
+                counts = [(len(new.names), len(old.names)) for new, old in zip(found, first, strict=True)]
+                kept, of = min(counts, key=lambda count: count[0] / count[1])
+                if kept >= MIN_KEPT * of:
+                    held = first[0].has_held_focal
+                    return _save([replace(camera, has_held_focal=held) for camera in found], path, names_of(first))
+                reason = f"only {kept} of {of} frames have a camera"
             except NoCamerasError as error:
                 reason = str(error)
             # The static regions were sufficient for the first pass; its cameras are as good as without masks.
-            first.save(path)
+            save_all(first, path)
             self.journal.notes.append(
                 f"the cameras may be wrong: they are from before what moves was masked, because after that {reason}"
             )
-            return f"{len(first.names)} frames, those of the first pass"
+            return f"{sum(map(len, names_of(first)))} frames, those of the first pass"
 
-        return self.journal.result(name, Cameras.load, make, Cameras.files)
+        return self._cameras(name, make)
 
     def _still(self, names: list[str]) -> Cameras:
         """The cameras of a tripod: all the same."""
-        width, height = self.frames.width, self.frames.height
+        width, height = self.videos[0].width, self.videos[0].height
         focal = self._focal or STILL_FOCAL * max(width, height)
         lens = self._known_lens or Lens.centered(focal, (width, height))
         if self._known_lens is None and self._focal is None:
@@ -144,95 +189,117 @@ class Steps:
     @property
     def _focal(self) -> float | None:
         """Known focal length of the frames [px]."""
-        return None if self.options.focal is None else self.options.focal * self.frames.factor
+        return None if self.options.focal is None else self.options.focal * self.videos[0].factor
 
     @property
     def _known_lens(self) -> Lens | None:
         """Known lens of the frames."""
         if self.options.intrinsics is None:
             return None
-        width, height = self.frames.width, self.frames.height
-        source = round(width / self.frames.factor), round(height / self.frames.factor)
+        width, height, factor = self.videos[0].width, self.videos[0].height, self.videos[0].factor
+        source = round(width / factor), round(height / factor)
         return read_intrinsics(self.options.intrinsics, source).resized(width, height)
 
-    def recover_background(self, name: str) -> Cameras:
+    def recover_background(self, name: str) -> list[Cameras]:
         """The cameras of all frames, without features that do not move with the background if that suffices."""
-        names = self.frames.names
-        if self.options.camera != "moving":
-            return self.recover(name, names, thorough=False)
+        if self.options.camera != "moving" or not self._moving:
+            return self.recover(name, self.names, thorough=False)
         background = self.find_background(BACKGROUND)
         try:
-            return self.recover(name, names, background, thorough=False)
+            return self.recover(name, self.names, background, thorough=False)
         except NoCamerasError:  # too few features, or all parallax is in the masked region
-            return self.recover(name, names, thorough=False)
+            return self.recover(name, self.names, thorough=False)
+
+    @property
+    def _moving(self) -> list[Frames]:
+        return [video for video in self.videos if not video.is_still]
 
     def find_background(self, name: str) -> Masks:
-        """Masks of what does not move with the background, found without cameras."""
+        """Masks of what does not move with the background of each camera that moves, found without cameras."""
 
-        def make(path: Path) -> str:
-            folder, names = self.frames.folder, self.frames.names
-            images = [resize_to_side(image, SIDE) for image in read_images(folder, names)]
-            size = self.frames.width, self.frames.height
-            off = [
+        def off(video: Frames) -> list[np.ndarray]:
+            images = [resize_to_side(image, SIDE) for image in read_images(video.folder, video.names)]
+            size = video.width, video.height
+            return [
                 cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
                 for mask in off_background(images, self.journal.quiet)
             ]
+
+        def make(path: Path) -> str:
             self._require_space(MASK_BYTES)
-            write_masks(path, names, off)
-            return f"{np.mean([mask.mean() for mask in off]):.1%} of the pixels do not move with it"
+            summary = write_masks(path, ((video.names, off(video)) for video in self._moving))
+            return summary.replace("move", "do not move with it")
 
-        return self.journal.result(name, Masks.load, make, self._mask_files(self.frames.names))
+        names = [name for video in self._moving for name in video.names]
+        return self.journal.result(name, Masks.load, make, self._mask_files(names))
 
-    def find_masks(self, name: str, cameras: Cameras, *, half_size: bool = False) -> Masks:
+    def find_masks(self, name: str, cameras: list[Cameras], *, half_size: bool = False) -> Masks:
         """The masks of the cameras' frames."""
         masker = MASKERS[self.options.masks]
         assert masker is not None
 
         def make(path: Path) -> str:
-            folder, weights, quiet = self.frames.folder, self.options.weights, self.journal.quiet
-            dynamic = find_masks(folder, cameras, masker, weights, half_size=half_size, quiet=quiet)
+            folder, weights, quiet = self._folder, self.options.weights, self.journal.quiet
+            find = partial(find_masks, folder, masker=masker, weights=weights, half_size=half_size, quiet=quiet)
             self._require_space(MASK_BYTES)
-            return write_masks(path, cameras.names, dynamic)
+            return write_masks(path, ((camera.names, find(camera)) for camera in cameras))
 
-        files = self._mask_files(cameras.names)
+        files = self._mask_files([name for camera in cameras for name in camera.names])
         return replace(self.journal.result(name, Masks.load, make, files), estimated=True)
 
     def copy_masks(self, name: str) -> Masks:
         """The masks given by the user, in the size of the frames."""
 
         def make(path: Path) -> str:
-            files = find_given_masks(Path(self.options.masks), self.frames.taken)
-            dynamic = [read_dynamic(file, (self.frames.width, self.frames.height)) for file in files]
+            found = [find_given_masks(Path(self.options.masks), video.taken) for video in self.videos]
             self._require_space(MASK_BYTES)
-            return write_masks(path, self.frames.names, dynamic)
+            return write_masks(
+                path,
+                (
+                    (video.names, [read_dynamic(file, (video.width, video.height)) for file in files])
+                    for video, files in zip(self.videos, found, strict=True)
+                ),
+            )
 
-        return self.journal.result(name, Masks.load, make, self._mask_files(self.frames.names))
+        names = [name for names in self.names for name in names]
+        return self.journal.result(name, Masks.load, make, self._mask_files(names))
 
-    def write_capture(self, name: str, cameras: Cameras, masks: Masks) -> None:
+    def write_capture(self, name: str, cameras: list[Cameras], masks: Masks) -> None:
         """Writes the capture without depth."""
 
         def make() -> str:
             self._require_space(IMAGE_BYTES)
             root, holdout, quiet = self.journal.root, self.options.holdout, self.journal.quiet
-            dynamic, estimated = masks.read_dynamic(cameras), masks.estimated
             summary, notes = write_capture(
-                root, self.frames, cameras, dynamic, estimated=estimated, holdout=holdout, quiet=quiet
+                root,
+                self.videos,
+                cameras,
+                masks.read_dynamic,
+                estimated=masks.estimated,
+                holdout=holdout,
+                quiet=quiet,
             )
-            self.journal.notes += [*notes, *self._doubts(cameras, dynamic, estimated)]
+            self.journal.notes += notes
+            for video, camera in zip(self.videos, cameras, strict=True):
+                whose = f"{video.source}: " if len(cameras) > 1 else ""
+                self.journal.notes += [whose + doubt for doubt in self._doubts(video, camera, masks)]
             return summary
 
-        self.journal.step(name, make, lambda: capture_files(self.journal.root, cameras.names))
+        names = [name for camera in cameras for name in camera.names]
+        self.journal.step(name, make, lambda: capture_files(self.journal.root, names))
 
-    def _doubts(self, cameras: Cameras, dynamic: Sequence[np.ndarray], estimated: bool) -> list[str]:
+    def _doubts(self, video: Frames, camera: Cameras, masks: Masks) -> list[str]:
         background = self.journal.work / BACKGROUND
-        off = Masks.load(background).read_dynamic(cameras) if background.is_dir() else None
-        found = doubts_of_masks(dynamic, estimated, off)
-        frames = load_posed_frames(self.frames.folder, cameras, WORKING_SIDE).halved
-        found += doubts_of_motion(frames, self.journal.quiet)
+        has_background = background.is_dir() and not video.is_still
+        off = Masks.load(background).read_dynamic(camera) if has_background else None
+        found = doubts_of_masks(masks.read_dynamic(camera), masks.estimated, off)
+        if not video.is_still:
+            frames = load_posed_frames(video.folder, camera, WORKING_SIDE).halved
+            found += doubts_of_motion(frames, self.journal.quiet)
         is_known = self.options.camera == "still" or self.options.focal or self.options.intrinsics
-        return found if is_known else [*found, *doubts_of_lens(cameras)]
+        return found if is_known else [*found, *doubts_of_lens(camera)]
 
-    def add_depth(self, name: str, cameras: Cameras) -> None:
+    def add_depth(self, name: str, cameras: list[Cameras]) -> None:
         """Adds depth to the capture."""
         method = DEPTHS[self.options.depth_method]
 
@@ -246,7 +313,8 @@ class Steps:
             return summary
 
         def files() -> list[Path]:
-            return [] if method is None else depth_files(self.journal.root, cameras.names)
+            names = [] if method is None else [n for camera in method.applies_to(cameras) for n in camera.names]
+            return depth_files(self.journal.root, names)
 
         self.journal.step(name, make, files)
 
@@ -254,20 +322,44 @@ class Steps:
     def _mask_files(names: Sequence[str]) -> Callable[[Path], list[Path]]:
         return partial(mask_files, names=names)
 
-    def _reconstruct(self, names: list[str], settings: Settings) -> Cameras:
+    def _reconstruct(self, names: Names, settings: Settings) -> list[Cameras]:
         self._require_space(FEATURE_BYTES)
-        quiet = self.journal.quiet
-        found = recover_cameras(self.frames.folder, names, self.journal.work / "colmap", settings, quiet)
-        require_frames(len(found.names), len(self.frames.names))  # ``names`` may already be a part of them
-        return found
+        quiet, work = self.journal.quiet, self.journal.work / "colmap"
+        if len(self.videos) == 1:
+            found = recover_cameras(self._folder, names[0], work, settings, quiet)
+            require_frames(len(found.names), len(self.videos[0].names))  # ``names`` may already be a part of them
+            return [found]
+        several = recover_several(self._folder, [*map(_shots, self.videos, names)], work, settings, quiet)
+        for k, video in enumerate(self.videos):
+            if video.is_still:  # all frames have the pose of its background
+                poses = np.repeat(several[k].poses, len(names[k]), axis=0)
+                several[k] = replace(several[k], names=names[k], poses=poses)
+        require_cameras(
+            [*map(len, names_of(several))], [*map(len, self.names)], [video.source for video in self.videos]
+        )
+        return several
+
+    @property
+    def _folder(self) -> Path:
+        return self.videos[0].folder
 
     def _require_space(self, bytes_per_pixel: int) -> None:
-        self.journal.require_space(self.frames.megabytes(bytes_per_pixel))
+        self.journal.require_space(sum(video.megabytes(bytes_per_pixel) for video in self.videos))
 
 
-def _save(cameras: Cameras, path: Path, names: Sequence[str]) -> str:
-    cameras.save(path)
+def _shots(video: Frames, names: list[str]) -> Shots:
+    """The images of a video that tell its cameras: all frames, or the background if it stands still."""
+    if video.is_still:
+        return Shots(video.source, [video.background], [video.taken[0].time])
+    times = {frame.name: frame.time for frame in video.taken}
+    return Shots(video.source, names, [times[name] for name in names])
+
+
+def _save(cameras: Sequence[Cameras], path: Path, names: Names) -> str:
+    save_all(cameras, path)
+    points = [camera.points for camera in cameras]
+    count = len(points[0]) if len(points) == 1 else len(np.unique(np.concatenate(points), axis=0))
     return (
-        f"{len(cameras.names)} of {len(names)} frames, {len(cameras.points)} points, "
-        f"reprojection error {cameras.error:.2f} px, triangulation angle {cameras.angle:.0f}°"
+        f"{sum(map(len, names_of(cameras)))} of {sum(map(len, names))} frames, {count} points, "
+        f"reprojection error {cameras[0].error:.2f} px, triangulation angle {cameras[0].angle:.0f}°"
     )

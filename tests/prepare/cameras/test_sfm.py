@@ -306,7 +306,7 @@ def test_the_focal_length_that_pairs_agree_on_is_the_true_one(tmp_path):
     opened.close()
     copy = calibrated(tmp_path / "features.db")
     assert copy != tmp_path / "features.db"
-    assert focal_guess.read_focal(copy) == pytest.approx(240.0, rel=0.02)
+    assert focal_guess.read_focals(copy)[0] == pytest.approx(240.0, rel=0.02)
 
 
 @pytest.mark.parametrize(("placed", "tried"), [(6, 1), (5, 2)])
@@ -315,7 +315,7 @@ def test_a_far_focal_length_that_loses_frames_has_a_rival(placed, tried, tmp_pat
 
     def map_from(job: Job, path: Path) -> SimpleNamespace:
         started.append(path)
-        return a_model(focal_guess.read_focal(path), placed=placed)
+        return a_model(focal_guess.read_focals(path)[0], placed=placed)
 
     agree_on(monkeypatch, 240.0)
     monkeypatch.setattr(mapping, "_map_from", map_from)

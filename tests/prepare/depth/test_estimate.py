@@ -20,6 +20,6 @@ def test_a_frame_without_any_depth_is_named(tmp_path):
     def estimate(frames: PosedFrames, dynamic: object, weights: None, quiet: bool) -> list[np.ndarray]:
         return [np.full((192, 256), np.nan if k == 2 else 0.5, np.float32) for k in range(4)]
 
-    summary, notes = add_depth(tmp_path, cameras, DepthMethod(estimate), None, True)
+    summary, notes = add_depth(tmp_path, [cameras], DepthMethod(estimate), None, True)
     assert summary == "known on 75% of the pixels"
     assert notes == ["depth is unknown everywhere in shot002"]

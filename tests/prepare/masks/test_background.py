@@ -1,5 +1,6 @@
 """What does not move with the background, without cameras."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 from tests.prepare import boards
 from warpgs.prepare.cameras.recovered import Cameras, NoCamerasError
 from warpgs.prepare.frames.images import resize_to_side
+from warpgs.prepare.frames.take import Frames, SourceFrame
 from warpgs.prepare.masks.background import SIDE, off_background
 from warpgs.prepare.masks.files import Masks
 from warpgs.prepare.options import Options
@@ -75,7 +77,7 @@ def test_a_single_frame_has_no_background():
     assert not off(followed(1, 5))[0].any()
 
 
-CAMERAS = Cameras(["a"], boards.lens(), boards.poses(2)[:1], boards.points(), 0.1, 10.0)
+CAMERAS = [Cameras(["a"], boards.lens(), boards.poses(2)[:1], boards.points(), 0.1, 10.0)]
 
 
 class Recorded(Steps):
@@ -94,7 +96,10 @@ class Recorded(Steps):
 @pytest.mark.parametrize(("camera", "tried"), [("moving", [Masks(), None]), ("turning", [None]), ("still", [None])])
 def test_cameras_are_found_without_the_guess_where_it_leaves_too_little(camera, tried):
     steps = object.__new__(Recorded)
-    parts = {"frames": SimpleNamespace(names=["a"]), "options": Options(camera=camera)}
+    parts = {
+        "videos": [Frames(Path(), [SourceFrame("a", "a.png", 0, 0)], 8, 6, 1.0)],
+        "options": Options(camera=camera),
+    }
     for name, part in {**parts, "journal": SimpleNamespace(calls=[])}.items():
         object.__setattr__(steps, name, part)
     assert steps.recover_background("cameras") is CAMERAS

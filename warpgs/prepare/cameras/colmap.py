@@ -26,12 +26,12 @@ from .features import Job, Report, extract_and_match, static_database
 from .mapping import reconstruct, refine
 from .matches import verified_matches
 from .model import cameras_of_model, read_model
-from .recovered import MISLED, Cameras, NoCamerasError
+from .recovered import MISLED, Cameras, NoCamerasError, save_all
 from .rotations import find_directions
 
 
-def run(job: Job, report: Report) -> Cameras:
-    """The cameras of the frames.
+def run(job: Job, report: Report) -> list[Cameras]:
+    """The frames of each camera, posed.
 
     Raises:
         NoCamerasError: If the frames are not suitable; the message says why and what to try.
@@ -42,7 +42,7 @@ def run(job: Job, report: Report) -> Cameras:
     database = static_database(job)
     if job.turns:
         report("directions", 0, 1)
-        return _find_directions(job, database)
+        return [_find_directions(job, database)]
     model_folder = work / "model"
     model = read_model(model_folder) if job.refine else None
     if model is not None:
@@ -52,7 +52,8 @@ def run(job: Job, report: Report) -> Cameras:
             model = None  # dynamic objects had misled the cameras: refined, they stay near what they were
     done = job
     if model is None:
-        _check_parallax(job, database)
+        if len(job.groups) == 1:
+            _check_parallax(job, database)
         model, done = reconstruct(job, database, report)
         if model is not None and job.thorough:
             model = refine(done, model, report)
@@ -64,8 +65,9 @@ def run(job: Job, report: Report) -> Cameras:
     if not job.refine:
         model_folder.mkdir(exist_ok=True)
         model.write(model_folder)
-    found = cameras_of_model(model, job.names, job.weak_features)
-    return replace(found, has_held_focal=done.focal != job.focal)
+    groups = [[job.names[k] for k in group] for group in job.groups]
+    found = cameras_of_model(model, groups, job.sources, job.weak_features)
+    return [replace(camera, has_held_focal=done.focal != job.focal) for camera in found]
 
 
 def _check_parallax(job: Job, database: Path) -> None:
@@ -124,7 +126,7 @@ def main() -> None:
 
     try:
         cameras = run(job, lambda label, done, total: write(label=label, done=done, total=total))
-        cameras.save(Path(job.work) / "cameras")
+        save_all(cameras, Path(job.work) / "cameras")
     except NoCamerasError as error:
         write(error=str(error), unsuitable=True)
     except (RuntimeError, IndexError, ValueError, OSError) as error:

@@ -2,13 +2,14 @@
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2  # noqa: F401  before pycolmap, see ``colmap``
 import pycolmap
 
-from .matches import has_features, keep_static, sequence_pairs
+from .matches import Pair, cross_pairs, has_features, keep_static, sequence_pairs
 from .recovered import NoCamerasError
 
 MAX_FEATURES = 2048
@@ -47,6 +48,9 @@ class Job:
         focal: Known focal length [px], which is kept; None to find it.
         refine: Whether to refine the reconstruction in the work folder instead of mapping from nothing, unless that
             shows that it was misled.
+        cameras: Index of each frame's camera, ascending; empty if there is one. A camera of one frame stands still.
+        times: Time of each frame on the clock of all cameras [ms].
+        sources: Video of each camera, for messages. All three are needed for several cameras only.
     """
 
     folder: str
@@ -60,6 +64,27 @@ class Job:
     refine: bool
     params: list[float] | None = None
     turns: bool = False
+    cameras: list[int] = field(default_factory=list)
+    times: list[int] = field(default_factory=list)
+    sources: list[str] = field(default_factory=list)
+
+    @property
+    def groups(self) -> list[list[int]]:
+        """Indices of the frames of each camera."""
+        if not self.cameras:
+            return [[*range(len(self.names))]]
+        return [[k for k, own in enumerate(self.cameras) if own == camera] for camera in sorted({*self.cameras})]
+
+    @property
+    def unmasked(self) -> set[str]:
+        """Names of the images without anything that moves, which have no masks."""
+        return {self.files[group[0]] for group in self.groups if len(group) == 1}
+
+    @property
+    def first_pairs(self) -> list[Pair]:
+        """Pairs of frames to match before anything is known: along each sequence, and across the cameras."""
+        along = [(group[a], group[b]) for group in self.groups for a, b in sequence_pairs(len(group))]
+        return along + cross_pairs(self.groups, self.times)
 
     @property
     def database(self) -> Path:
@@ -85,34 +110,40 @@ class Job:
 def extract_and_match(job: Job, report: Report) -> None:
     """Features and matches along the sequence, unless they are in the database."""
     finished = job.database.with_suffix(".done")
-    if finished.exists() and has_features(job.database, job.files):
+    if finished.exists() and has_features(job.database, job.files, len(job.first_pairs)):
         return
     finished.unlink(missing_ok=True)
     for end in ("", "-wal", "-shm"):  # a new database cannot be made next to the log of another one
         Path(f"{job.database}{end}").unlink(missing_ok=True)
-    reading, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
-    reading.camera_model = job.lens
-    if (params := _starting_parameters(job)) is not None:
-        reading.camera_params = ",".join(map(str, params))
+    extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = MAX_FEATURES
     extraction.sift.max_num_orientations = 1
     if job.weak_features:
         extraction.sift.peak_threshold = WEAK_PEAK
-    files, single = job.files, pycolmap.CameraMode.SINGLE
-    for start in range(0, len(files), CHUNK):
-        report("features", start, len(files))
-        chunk = files[start : start + CHUNK]
-        pycolmap.extract_features(job.database, job.folder, chunk, single, reading, extraction, pycolmap.Device.cpu)
-        reading.existing_camera_id = 1
-    match(job, sequence_pairs(len(files)), report)
+    for camera, group in enumerate(job.groups, 1):
+        _extract(job, camera, [job.files[k] for k in group], extraction, report)
+    match(job, job.first_pairs, report)
     finished.touch()
 
 
-def _starting_parameters(job: Job) -> list[float] | None:
+def _extract(job: Job, camera: int, files: list[str], extraction: Any, report: Report) -> None:
+    """Features of the images of a camera, which is the ``camera``-th in the database, from 1 on."""
+    reading, single = pycolmap.ImageReaderOptions(), pycolmap.CameraMode.SINGLE
+    reading.camera_model = job.lens
+    if (params := _starting_parameters(job, files[0])) is not None:
+        reading.camera_params = ",".join(map(str, params))
+    for start in range(0, len(files), CHUNK):
+        report("features", job.files.index(files[start]), len(job.files))
+        chunk = files[start : start + CHUNK]
+        pycolmap.extract_features(job.database, job.folder, chunk, single, reading, extraction, pycolmap.Device.cpu)
+        reading.existing_camera_id = camera
+
+
+def _starting_parameters(job: Job, file: str) -> list[float] | None:
     """Parameters of the lens that are known, or that a fisheye lens starts from; None for COLMAP's own guess."""
     if job.params is not None or (job.focal is None and job.lens != FISHEYE):
         return job.params
-    first = pycolmap.Bitmap.read(Path(job.folder) / job.files[0], False)
+    first = pycolmap.Bitmap.read(Path(job.folder) / file, False)
     focal = job.focal or FISHEYE_FOCAL * max(first.width, first.height)
     return list(pycolmap.Camera.create_from_model_name(1, job.lens, focal, first.width, first.height).params)
 
@@ -134,7 +165,7 @@ def static_database(job: Job) -> Path:
     """A copy of the database with the matches in static regions of the job's frames."""
     database = job.database.with_suffix(".static.db")
     shutil.copyfile(job.database, database)
-    features = keep_static(database, None if job.masks is None else Path(job.masks), job.files)
+    features = keep_static(database, None if job.masks is None else Path(job.masks), job.files, job.unmasked)
     if features < MIN_FEATURES:
         where, remedy = "", "record textured objects, in more light"
         if job.masks is not None:

@@ -7,6 +7,7 @@ pairs, within 20 % on real clips, but is wrong where all cameras look at one poi
 """
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,15 @@ def calibrated(database: Path) -> Path:
     """A copy of the database with the focal length that its pairs agree on, or the database if that is not far away.
 
     Args:
-        database: COLMAP's database with verified matches and one camera.
+        database: COLMAP's database with verified matches.
     """
     copy = database.with_suffix(".calibrated.db")
     shutil.copyfile(database, copy)
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed = 0
-    is_far = pycolmap.calibrate_view_graph(copy, options) and not _are_near(read_focal(copy), read_focal(database), FAR)
+    is_far = pycolmap.calibrate_view_graph(copy, options) and not _are_near(
+        read_focals(copy), read_focals(database), FAR
+    )
     if is_far:
         return copy
     copy.unlink()
@@ -41,8 +44,9 @@ def calibrated(database: Path) -> Path:
 
 
 def confirms(model: Any, database: Path) -> bool:
-    """Whether a reconstruction's focal length is still near that of the database that it started from."""
-    return _are_near(focal_of(model), read_focal(database), CONFIRMED)
+    """Whether a reconstruction's focal lengths are still near those of the database that it started from."""
+    found = [model.cameras[key].mean_focal_length() for key in sorted(model.cameras)]
+    return _are_near(found, read_focals(database), CONFIRMED)
 
 
 def is_plausible(model: Any) -> bool:
@@ -58,14 +62,14 @@ def focal_of(model: Any) -> float:
     return float(camera.mean_focal_length())
 
 
-def _are_near(a: float, b: float, factor: float) -> bool:
-    return bool(abs(np.log(a / b)) < np.log(factor))
+def _are_near(a: Sequence[float], b: Sequence[float], factor: float) -> bool:
+    return bool(np.abs(np.log(np.array(a) / np.array(b))).max() < np.log(factor))
 
 
-def read_focal(database: Path) -> float:
-    """The focal length of the camera in a database [px]."""
+def read_focals(database: Path) -> list[float]:
+    """The focal lengths of the cameras in a database [px]."""
     opened = pycolmap.Database.open(database)
     try:
-        return float(opened.read_all_cameras()[0].mean_focal_length())
+        return [float(camera.mean_focal_length()) for camera in opened.read_all_cameras()]
     finally:
         opened.close()

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from .features import Job, Report, match, static_database
-from .focal_guess import calibrated, confirms, focal_of, is_plausible, read_focal
+from .focal_guess import calibrated, confirms, focal_of, is_plausible, read_focals
 from .matches import all_pairs, revisit_pairs
 
 FALLBACK_FRAMES = 250
@@ -60,9 +60,9 @@ def reconstruct(job: Job, database: Path, report: Report) -> tuple[Any, Job]:
     mapped again with COLMAP's guess held, and the reconstruction that explains more is kept: some lenses are long.
     """
     model = _map(job, database, report)
-    if model is None or not job.guesses_focal or is_plausible(model):
+    if model is None or not job.guesses_focal or len(job.groups) > 1 or is_plausible(model):
         return model, job
-    held = replace(job, focal=read_focal(database))
+    held = replace(job, focal=read_focals(database)[0])
     return max(((_map(held, database, report), held), (model, job)), key=lambda found: explained(found[0]))
 
 
@@ -75,12 +75,22 @@ def explained(model: Any) -> float:
 def _map(job: Job, database: Path, report: Report) -> Any:
     """The reconstruction with the most frames, by global, else incremental mapping, else with all pairs; or None."""
     count, attempts = len(job.names), [_map_globally(job, database, report)]
-    if _size(attempts[0]) < ENOUGH * count:
+    if not _is_enough(job, attempts[0]):
         attempts.append(_map_incrementally(job, database, report))
-        if max(map(_size, attempts)) < ENOUGH * count <= ENOUGH * FALLBACK_FRAMES:
+        if count <= FALLBACK_FRAMES and not any(_is_enough(job, model) for model in attempts):
             match(job, all_pairs(count), report)
             attempts.append(_map_incrementally(job, static_database(job), report))
-    return max(attempts, key=_size)
+    return max(attempts, key=lambda model: (_num_cameras(model), _size(model)))
+
+
+def _is_enough(job: Job, model: Any) -> bool:
+    """Whether nearly all frames, and some of each camera, are placed."""
+    return _size(model) >= ENOUGH * len(job.names) and (len(job.groups) == 1 or _num_cameras(model) == len(job.groups))
+
+
+def _num_cameras(model: Any) -> int:
+    placed = () if model is None else model.images.values()
+    return len({image.camera_id for image in placed if image.has_pose})
 
 
 def _size(model: Any) -> int:
@@ -101,7 +111,7 @@ def _map_globally(job: Job, database: Path, report: Report) -> Any:
     model = _map_from(job, start)
     if start == database:
         return model
-    is_confirmed = _size(model) >= ENOUGH * len(job.names) and confirms(model, start)
+    is_confirmed = _is_enough(job, model) and confirms(model, start)
     start.unlink()  # a copy
     if is_confirmed:
         return model
@@ -137,7 +147,7 @@ def _supported(model: Any) -> Any:
 
 
 def continuous(model: Any) -> Any:
-    """The reconstruction without frames that have a scale of their own; the longest sequence of one scale remains.
+    """The reconstruction without frames that have a scale of their own; each camera's longest sequence of one remains.
 
     Frames that share few points with those before them, or hardly move, may end anywhere on the rays to these points.
     At most ``MAX_SKIPPED`` of them in a row are skipped; more end a sequence, because what comes after them hangs on
@@ -145,8 +155,11 @@ def continuous(model: Any) -> Any:
     """
     placed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     images = [image for image in placed if any(point.has_point3D() for point in image.points2D)]
-    sequence = _longest_sequence([float(np.log(_median_depth(model, image))) for image in images])
-    kept = {images[k].image_id for k in sequence}
+    kept = set()
+    for camera in {image.camera_id for image in images}:
+        own = [image for image in images if image.camera_id == camera]
+        sequence = _longest_sequence([float(np.log(_median_depth(model, image))) for image in own])
+        kept |= {own[k].image_id for k in sequence}
     for image in placed:
         if image.image_id not in kept:
             model.deregister_frame(image.frame_id)
@@ -191,10 +204,10 @@ def refine(job: Job, model: Any, report: Report) -> Any:
     A plausible focal length that adjustment makes implausible is held instead.
     """
     if job.thorough:
-        match(job, revisit_pairs(model, job.files), report)
+        match(job, revisit_pairs(model, job.files, job.groups), report)
     report("refinement", 0, 1)
     refined = _adjusted(job, copy.deepcopy(model))
-    if job.guesses_focal and is_plausible(model) and not is_plausible(refined):
+    if job.guesses_focal and len(job.groups) == 1 and is_plausible(model) and not is_plausible(refined):
         refined = _adjusted(replace(job, focal=focal_of(model)), model)
     return continuous(refined)
 

@@ -1,5 +1,7 @@
 """Pairs of frames to match, and COLMAP's matches: those in static regions, and those that show parallax."""
 
+import itertools
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,12 @@ NUM_REVISITS = 3
 MIN_SHARED = 0.5
 """Fraction of a frame's points in the image of a frame far away in time, from which on the two are matched."""
 
+KEYFRAMES = 8
+"""Of every how many frames of two cameras all pairs are matched: they may see the same at different times."""
+
+APART = 100_000
+"""Distance of the frames of two cameras, in frames: farther than any of one camera."""
+
 Pair = tuple[int, int]
 
 
@@ -34,13 +42,30 @@ def all_pairs(count: int) -> list[Pair]:
     return [(a, b) for a in range(count) for b in range(a + 1, count)]
 
 
-def revisit_pairs(model: Any, names: list[str]) -> list[Pair]:
-    """Pairs of frames far apart in time that see the same points, according to a reconstruction.
+def cross_pairs(groups: Sequence[Sequence[int]], times: Sequence[int]) -> list[Pair]:
+    """Pairs of frames of two cameras: each with the one nearest in time, and all of every ``KEYFRAMES``-th.
+
+    Args:
+        groups: Indices of the frames of each camera, in temporal order. A single one of a camera is paired with all.
+        times: Time of every frame [ms].
+    """
+    pairs = set()
+    for first, second in itertools.combinations(groups, 2):
+        pairs |= {(a, min(second, key=lambda b: abs(times[a] - times[b]))) for a in first}
+        pairs |= {(min(first, key=lambda a: abs(times[a] - times[b])), b) for b in second}
+        pairs |= {*itertools.product(first[::KEYFRAMES], second[::KEYFRAMES])}
+    return sorted(pairs)
+
+
+def revisit_pairs(model: Any, names: list[str], groups: Sequence[Sequence[int]] = ()) -> list[Pair]:
+    """Pairs of frames far apart in time, or of two cameras, that see the same points, according to a reconstruction.
 
     Args:
         model: COLMAP's reconstruction.
-        names: Names of the images, in temporal order.
+        names: Names of the images.
+        groups: Indices of the images of each camera, in temporal order; those of one camera if empty.
     """
+    order = {k: place + APART * camera for camera, group in enumerate(groups) for place, k in enumerate(group)}
     images = {image.name: image for image in model.images.values() if image.has_pose}
     points = {key: point.xyz for key, point in model.points3D.items()}
     frames = [(k, images[name]) for k, name in enumerate(names) if name in images]
@@ -54,14 +79,15 @@ def revisit_pairs(model: Any, names: list[str]) -> list[Pair]:
     shared = np.minimum(shared, shared.T)
     pairs = set()
     for row, (index, _) in enumerate(frames):
-        score = shared[row].copy()
-        score[[abs(other - index) <= OVERLAP for other, _ in frames]] = 0.0
+        score, place = shared[row].copy(), order.get(index, index)
+        score[[abs(order.get(other, other) - place) <= OVERLAP for other, _ in frames]] = 0.0
         for _ in range(NUM_REVISITS):
             best = int(score.argmax())
             if score[best] < MIN_SHARED:
                 break
             pairs.add((min(index, frames[best][0]), max(index, frames[best][0])))
-            score[[abs(other - frames[best][0]) < OVERLAP // 2 for other, _ in frames]] = 0.0
+            found = order.get(frames[best][0], frames[best][0])
+            score[[abs(order.get(other, other) - found) < OVERLAP // 2 for other, _ in frames]] = 0.0
     return sorted(pairs)
 
 
@@ -79,12 +105,13 @@ def _visible(
     return (in_camera[..., 2] > 0) & (np.abs(in_camera[..., :2] / depth[..., None]) < limits[:, None]).all(2)
 
 
-def has_features(database: Path, names: list[str]) -> bool:
-    """Whether a database can be read and has the features of some images, and the pairs along the sequence of all.
+def has_features(database: Path, names: list[str], num_pairs: int) -> bool:
+    """Whether a database can be read and has the features of some images, and enough pairs.
 
     Args:
         database: COLMAP's database.
         names: Names of the images.
+        num_pairs: Number of pairs that were matched at least.
     """
     if not database.is_file():
         return False
@@ -94,7 +121,7 @@ def has_features(database: Path, names: list[str]) -> bool:
         return False
     try:
         images = {image.name: image.image_id for image in opened.read_all_images()}
-        is_matched = opened.num_matched_image_pairs() >= len(sequence_pairs(len(images)))
+        is_matched = opened.num_matched_image_pairs() >= num_pairs
         return is_matched and all(name in images and opened.exists_descriptors(images[name]) for name in names)
     except RuntimeError:  # damaged further inside
         return False
@@ -102,17 +129,21 @@ def has_features(database: Path, names: list[str]) -> bool:
         opened.close()
 
 
-def keep_static(database: Path, masks: Path | None, names: list[str]) -> float:
+def keep_static(database: Path, masks: Path | None, names: list[str], unmasked: Collection[str] = ()) -> float:
     """Removes matches of other images, and those in dynamic regions; returns the mean number of static features.
 
     Args:
         database: COLMAP's database, which is changed.
         masks: Folder of masks <image>.png, 0 = dynamic; None if nothing is.
         names: Names of the images to keep.
+        unmasked: Names of the images that have no mask, because nothing moves.
     """
     opened = pycolmap.Database.open(database)
     try:
-        static = {i.image_id: _static(opened, i, masks, i.name in names) for i in opened.read_all_images()}
+        static = {}
+        for image in opened.read_all_images():
+            own = None if image.name in unmasked else masks
+            static[image.image_id] = _static(opened, image, own, image.name in names)
         for key, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             a, b = pycolmap.pair_id_to_image_pair(key)
             matches = np.asarray(geometry.inlier_matches)

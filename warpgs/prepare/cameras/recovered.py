@@ -1,7 +1,7 @@
 """Cameras and sparse points as structure from motion recovers them."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,6 +41,27 @@ def require_frames(count: int, of: int) -> None:
         )
 
 
+def require_cameras(counts: Sequence[int], of: Sequence[int], sources: Sequence[str]) -> None:
+    """Raises NoCamerasError unless each of several cameras has poses of ``MIN_REGISTERED`` of its frames.
+
+    Args:
+        counts: Number of posed frames of each camera.
+        of: Number of its frames.
+        sources: Its video, for the message.
+    """
+    for count, total, source in zip(counts, of, sources, strict=True):
+        if count == 0:
+            raise NoCamerasError(
+                f"{source} shares no view with the other videos: too little of what stands still is seen by it and by "
+                "another one; film the same surfaces from directions less than about 30° apart, or leave it away"
+            )
+        if count < MIN_REGISTERED * total:
+            raise NoCamerasError(
+                f"cameras were found for only {count} of {total} frames of {source}: it moves too fast, or shares too "
+                "little of its view with the other videos; take more frames (--fps, --count), or leave it away"
+            )
+
+
 def are_apart(centers: Float[np.ndarray, "F 3"]) -> bool:
     """Whether cameras are at different places, by more than the rounding of their files."""
     return bool(np.ptp(centers, axis=0).max() > 1e-6 * (1.0 + np.abs(centers).max()))
@@ -48,13 +69,13 @@ def are_apart(centers: Float[np.ndarray, "F 3"]) -> bool:
 
 @dataclass(frozen=True)
 class Cameras:
-    """Posed frames of one lens, and sparse points.
+    """Posed frames of one camera, with one lens, and sparse points.
 
     Attributes:
         names: Frames that were registered, in temporal order.
         lens: The lens of all frames.
         poses: [F, 3, 4] world to camera, OpenCV axes.
-        points: [P, 3] in the world.
+        points: [P, 3] in the world; of one of several cameras, those that it sees.
         error: Mean reprojection error [px].
         angle: Median triangulation angle of the points [degrees].
         weak_features: Whether features of low contrast were used.
@@ -96,18 +117,13 @@ class Cameras:
         )
 
     @staticmethod
-    def files(path: Path) -> list[Path]:
-        """The file that ``save`` wrote."""
-        return [path.with_name(path.name + ".npz")]
-
-    @staticmethod
     def load(path: Path) -> "Cameras":
         """The cameras that ``save`` wrote.
 
         Raises:
             ValueError: If the file is missing or damaged.
         """
-        (file,) = Cameras.files(path)
+        file = path.with_name(path.name + ".npz")
         archive = Archive(file, MAX_BYTES)
         contents = {name.removesuffix(".npy"): archive.read(name, MAX_BYTES) for name in archive.sizes}
         try:
@@ -133,6 +149,30 @@ class Cameras:
         error, angle = z["quality"].tolist()
         flags = map(bool, z["flags"])
         return Cameras(z["names"].tolist(), lens, z["poses"], z["points"], error, angle, *flags)
+
+
+def save_all(cameras: Sequence[Cameras], path: Path) -> None:
+    """Writes <path>-<k>.npz for each of several cameras, or <path>.npz for one."""
+    for own, place in zip(cameras, _paths(path, len(cameras)), strict=True):
+        own.save(place)
+
+
+def load_all(path: Path, count: int) -> list[Cameras]:
+    """The ``count`` cameras that ``save_all`` wrote.
+
+    Raises:
+        ValueError: If a file is missing or damaged.
+    """
+    return [Cameras.load(place) for place in _paths(path, count)]
+
+
+def files_of_all(path: Path, count: int) -> list[Path]:
+    """The files of ``count`` cameras that ``save_all`` writes."""
+    return [place.with_name(place.name + ".npz") for place in _paths(path, count)]
+
+
+def _paths(path: Path, count: int) -> list[Path]:
+    return [path] if count == 1 else [path.with_name(f"{path.name}-{k}") for k in range(count)]
 
 
 def camera_centers(poses: Float[np.ndarray, "F 3 4"]) -> Float[np.ndarray, "F 3"]:

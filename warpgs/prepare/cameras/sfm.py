@@ -1,7 +1,7 @@
 """Structure from motion with COLMAP: cameras and sparse points of a video's frames.
 
-SIFT features, matching, incremental mapping with bundle adjustment; one lens for all frames. COLMAP runs in a process
-of its own (``colmap``): a crash, a full disk or Ctrl-C there is one line here.
+SIFT features, matching, global or incremental mapping with bundle adjustment; one lens for all frames of a camera.
+COLMAP runs in a process of its own (``colmap``): a crash, a full disk or Ctrl-C there is one line here.
 """
 
 import errno
@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from warpgs.data.colmap import parameters_of_lens
 from warpgs.data.lens import Lens
 
 from ..options import LensModel
-from .recovered import Cameras, NoCamerasError
+from .recovered import Cameras, NoCamerasError, load_all
 
 MIN_FREE = 5_000_000
 """Free disk space below which a failure of COLMAP is attributed to a full disk [bytes]."""
@@ -54,7 +55,7 @@ class Settings:
 
 
 def recover_cameras(folder: Path, names: list[str], work: Path, settings: Settings, quiet: bool = True) -> Cameras:
-    """The cameras of the frames <folder>/<name>.png.
+    """The cameras of the frames <folder>/<name>.png of one video.
 
     ``work`` is for COLMAP's files; features and matches in it are used again.
 
@@ -63,9 +64,44 @@ def recover_cameras(folder: Path, names: list[str], work: Path, settings: Settin
         ValueError: If COLMAP itself failed.
         OSError: If the disk is full.
     """
-    work.mkdir(parents=True, exist_ok=True)
+    return _recover(_job(folder, names, work, settings), 1, quiet)[0]
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Frames of one of several cameras.
+
+    Attributes:
+        source: Its video, for messages.
+        names: Names of the frames; a single one if it stands still.
+        times: Their times on the clock of all cameras [ms].
+    """
+
+    source: str
+    names: list[str]
+    times: list[int]
+
+
+def recover_several(
+    folder: Path, cameras: Sequence[Shots], work: Path, settings: Settings, quiet: bool = True
+) -> list[Cameras]:
+    """The cameras of the frames of several videos in one world, in the order of ``cameras``.
+
+    Other arguments and errors as for ``recover_cameras``.
+    """
+    several = {
+        "cameras": [k for k, camera in enumerate(cameras) for _ in camera.names],
+        "times": [time for camera in cameras for time in camera.times],
+        "sources": [camera.source for camera in cameras],
+    }
+    job = _job(folder, [name for camera in cameras for name in camera.names], work, settings)
+    return _recover({**job, **several}, len(cameras), quiet)
+
+
+def _job(folder: Path, names: list[str], work: Path, settings: Settings) -> dict[str, Any]:
+    """The fields of ``features.Job``."""
     model, params = (settings.lens, None) if settings.known is None else parameters_of_lens(settings.known)
-    job = {
+    return {
         "folder": str(folder.resolve()),
         "names": names,
         "work": str(work.resolve()),
@@ -78,9 +114,15 @@ def recover_cameras(folder: Path, names: list[str], work: Path, settings: Settin
         "focal": settings.focal,
         "refine": settings.refine and (work / "model").is_dir(),
     }
+
+
+def _recover(job: dict[str, Any], num_cameras: int, quiet: bool) -> list[Cameras]:
+    """The cameras that COLMAP's process finds."""
+    folder, work = job["folder"], Path(job["work"])
+    work.mkdir(parents=True, exist_ok=True)
     code, answer = _run(job, work / LOG, quiet)
     if answer.get("result") and code == 0:
-        return Cameras.load(work / str(answer["result"]))
+        return load_all(work / str(answer["result"]), num_cameras)
     if shutil.disk_usage(work).free < MIN_FREE:
         raise OSError(errno.ENOSPC, "No space left on device", str(work))
     if answer.get("unsuitable"):

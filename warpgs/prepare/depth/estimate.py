@@ -1,6 +1,5 @@
 """A method that estimates inverse depth, and the files of the depth that it finds for a capture."""
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,20 +36,26 @@ class DepthMethod:
         estimate: Inverse depth [H, W] of the frames up to scale and offset, NaN where unknown, from the frames, their
             dynamic masks, the folder of the network's weights (None without a network), and whether to be quiet.
         network: The network that it needs.
+        needs_parallax: Whether the camera must move.
     """
 
     estimate: Callable[[PosedFrames, Iterable[Bool[np.ndarray, "H W"]], Path | None, bool], Planes]
     network: Network | None = None
+    needs_parallax: bool = False
+
+    def applies_to(self, cameras: Sequence[Cameras]) -> list[Cameras]:
+        """Those cameras whose frames it can estimate depth of."""
+        return [camera for camera in cameras if camera.have_parallax or not self.needs_parallax]
 
 
 def add_depth(
-    root: Path, cameras: Cameras, method: DepthMethod, weights: Path | None, quiet: bool
+    root: Path, cameras: Sequence[Cameras], method: DepthMethod, weights: Path | None, quiet: bool
 ) -> tuple[str, list[str]]:
     """Estimates the depth of a capture's frames and writes it, with the contact sheet depth.png.
 
     Args:
         root: Folder of the capture.
-        cameras: Cameras that the capture was written with.
+        cameras: The frames of each camera that the capture was written with.
         method: How to estimate depth.
         weights: Folder with the networks' weights; None for the Hugging Face cache.
         quiet: Whether to show no progress.
@@ -61,20 +66,26 @@ def add_depth(
     Raises:
         OSError: If a file cannot be written; the message names it.
     """
-    frames = load_posed_frames(root / "rgb/1x", cameras, MAX_SIDE, max_factor=1.0)
-    folder = find_weights(method.network, weights)
-    dynamic = _dynamic_masks(root, cameras, (frames.lens.width, frames.lens.height))
-    planes = method.estimate(frames, dynamic, folder, quiet)
-    for name, plane in zip(cameras.names, planes, strict=True):
-        write_depth(root, name, as_half(plane))
-    if not cameras.have_parallax:
-        _place_points(root, cameras, planes)
-    shown = {k: colored_depth(planes[k]) for k in choose_evenly(len(planes))}
-    write_contact_sheet(root / "depth.png", shown, cameras.names)
-    known = [float(np.isfinite(plane).mean()) for plane in planes]
-    unknown = [name for name, fraction in zip(cameras.names, known, strict=True) if fraction == 0.0]
+    known: dict[str, float] = {}
+    sheets, folder, chosen = [], find_weights(method.network, weights), method.applies_to(cameras)
+    for camera in chosen:
+        frames = load_posed_frames(root / "rgb/1x", camera, MAX_SIDE, max_factor=1.0)
+        dynamic = _dynamic_masks(root, camera, (frames.lens.width, frames.lens.height))
+        planes = method.estimate(frames, dynamic, folder, quiet)
+        for name, plane in zip(camera.names, planes, strict=True):
+            write_depth(root, name, as_half(plane))
+            known[name] = float(np.isfinite(plane).mean())
+        if len(cameras) == 1 and not camera.have_parallax:
+            _place_points(root, camera, planes)
+        shown = choose_evenly(len(planes), len(chosen))
+        sheets.append({camera.names[k]: colored_depth(planes[k]) for k in shown})
+    if not chosen:
+        return "none, because no camera moves", []
+    write_contact_sheet(root / "depth.png", sheets)
+    whose = " of the cameras that move" if len(chosen) < len(cameras) else ""
+    unknown = [name for name, fraction in known.items() if fraction == 0.0]
     notes = [f"depth is unknown everywhere in {few_of(unknown)}"] if unknown else []
-    return f"known on {np.mean(known):.0%} of the pixels", notes
+    return f"known on {np.mean([*known.values()]):.0%} of the pixels{whose}", notes
 
 
 def depth_files(root: Path, names: Sequence[str]) -> list[Path]:
@@ -87,7 +98,7 @@ def _place_points(root: Path, cameras: Cameras, planes: Planes) -> None:
     masks = list(_dynamic_masks(root, cameras, (cameras.lens.width, cameras.lens.height)))
     points = points_around(cameras, masks, planes)
     if len(points):
-        write_world(root, dataclasses.replace(cameras, points=points))
+        write_world(root, points, cameras.poses)
 
 
 def _dynamic_masks(root: Path, cameras: Cameras, size: tuple[int, int]) -> Iterator[Bool[np.ndarray, "H W"]]:

@@ -22,7 +22,7 @@ def _anything(
 
 
 DEPTHS: dict[str, DepthMethod | None] = {
-    "flow": DepthMethod(lambda frames, dynamic, weights, quiet: static_depth(frames, list(dynamic), quiet)),
+    "flow": DepthMethod(lambda frames, dynamic, weights, quiet: static_depth(frames, list(dynamic), quiet), None, True),
     "anything": DepthMethod(_anything, DEPTH_ANYTHING),
     "none": None,
 }

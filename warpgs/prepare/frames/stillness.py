@@ -1,4 +1,4 @@
-"""Whether a camera stands still."""
+"""Whether a camera stands still, and what it sees where nothing moves."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,14 +14,29 @@ from .images import read_images, resize_to_side
 SIDE, NUM_CORNERS, MIN_CORNERS = 512, 400, 40
 """Longest side of the images that are compared [px], and maximum and minimum number of corners that are followed."""
 
-MAX_SHIFT = 0.75
-"""Distance up to which a corner stays where it is [px]."""
+MAX_SHIFT, MIN_STAYING, MIN_STILL = 0.75, 0.5, 0.9
+"""Distance up to which a corner stays where it is [px], fraction of the corners that do so in a frame of a camera that
+stands still, because things move before it, and fraction of such frames."""
 
 MIN_LIKELY = 0.25
 """Fraction of the corners that stay in the median frame, below which a camera cannot stand still."""
 
 NUM_COMPARED, NUM_MEDIAN = 16, 31
 """Number of frames that are compared with the middle one, and that the background is the median of."""
+
+BAND = 64
+"""Rows whose median is computed together."""
+
+
+def find_background(folder: Path, names: Sequence[str]) -> UInt8[np.ndarray, "H W 3"] | None:
+    """[H, W, 3] the median over time of the frames <folder>/<name>.png; None if the camera moves."""
+    return median(folder, names) if stands_still(folder, names) else None
+
+
+def stands_still(folder: Path, names: Sequence[str]) -> bool:
+    """Whether most corners stay where they are in nearly all frames."""
+    staying = staying_corners(folder, names)
+    return bool(staying) and float(np.mean(np.array(staying) >= MIN_STAYING)) >= MIN_STILL
 
 
 def require_still(folder: Path, names: Sequence[str]) -> None:
@@ -52,3 +67,11 @@ def _staying(a: UInt8[np.ndarray, "H W"], b: UInt8[np.ndarray, "H W"], corners: 
     moved, found, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None)
     shifts = np.linalg.norm((moved - corners).reshape(-1, 2), axis=1)
     return float(((shifts < MAX_SHIFT) & (found.ravel() > 0)).mean())
+
+
+def median(folder: Path, names: Sequence[str]) -> UInt8[np.ndarray, "H W 3"]:
+    """[H, W, 3] the median over time of some frames, evenly spaced."""
+    images = list(read_images(folder, evenly_spaced(names, NUM_MEDIAN)))
+    rows = range(0, len(images[0]), BAND)
+    bands = [np.median([image[row : row + BAND] for image in images], axis=0) for row in rows]
+    return np.concatenate(bands).round().astype(np.uint8)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -19,6 +19,8 @@ from warpgs.files import natural_order, read_json, write_json, write_png
 
 from ..options import MAX_FRAMES, MIN_FRAMES, Selection
 from .images import resize_to_side, sharpness
+from .offsets import Clock
+from .stillness import find_background
 from .video import TakenImage, read_video
 
 MIN_LONGEST_SIDE = 64
@@ -29,8 +31,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 CONVERTIBLE = (".heic", ".heif", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".dng")
 """Suffixes of images that are not read: phones write HEIC."""
 
-INDEX = "frames.json"
-"""Index of the frames in their folder."""
+PREFIX = "frame"
+"""First part of the names of a single camera's frames; the frames of several cameras have the camera's number."""
 
 MAX_TIME = 2**53
 """Maximum of a time, so that double precision represents it."""
@@ -44,8 +46,8 @@ class SourceFrame:
         name: Its id in the capture.
         source: Its origin, for messages: the name of a file, or the frame number in a video.
         step: Its index in the source.
-        time: Its time: milliseconds in a video; in a folder seconds, milliseconds or numbers that its names tell, else
-            its index.
+        time: Its time: milliseconds in a video, from the start of the first of several; in a folder seconds,
+            milliseconds or numbers that its names tell, else its index.
     """
 
     name: str
@@ -56,13 +58,15 @@ class SourceFrame:
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of a capture as recorded, in files <folder>/<name>.png.
+    """The frames of one camera as recorded, in files <folder>/<name>.png.
 
     Attributes:
         folder: Folder of the files.
         taken: The frames, in temporal order.
         width, height: Their size [px].
         factor: Their size over that of the source.
+        source: The video or folder, for messages.
+        is_still: Whether the camera is one of several and stands still; then ``background`` is a file, too.
     """
 
     folder: Path
@@ -70,22 +74,56 @@ class Frames:
     width: int
     height: int
     factor: float
+    source: str = ""
+    is_still: bool = False
 
     @staticmethod
-    def load(folder: Path) -> "Frames":
-        """The frames that ``take_frames`` wrote."""
-        index = read_json(folder / INDEX)
+    def load(folder: Path, prefix: str = PREFIX) -> "Frames":
+        """The frames of one camera that ``save`` listed."""
+        index = read_json(index_of(folder, prefix))
         taken = [SourceFrame(str(f["name"]), str(f["source"]), int(f["step"]), int(f["time"])) for f in index["frames"]]
-        return Frames(folder, taken, int(index["width"]), int(index["height"]), float(index["factor"]))
+        size = int(index["width"]), int(index["height"]), float(index["factor"])
+        return Frames(folder, taken, *size, str(index["source"]), bool(index["is_still"]))
+
+    @staticmethod
+    def load_all(folder: Path) -> list["Frames"]:
+        """The frames of all cameras.
+
+        Raises:
+            ValueError: If there are none.
+        """
+        prefixes = [path.stem.removeprefix("index_") for path in sorted(folder.glob("index_*.json"))]
+        if not prefixes:
+            raise ValueError(f"{folder} has no index of frames")
+        return [Frames.load(folder, prefix) for prefix in prefixes]
 
     @staticmethod
     def files(folder: Path) -> list[Path]:
-        """The files that ``take_frames`` wrote; only their index if that is damaged."""
+        """The files of all cameras' frames; only the index of the first if it is missing or damaged."""
         try:
-            names = Frames.load(folder).names
+            cameras = Frames.load_all(folder)
         except (KeyError, TypeError, ValueError):
-            names = []
-        return [folder / INDEX, *(folder / f"{name}.png" for name in names)]
+            return [*sorted(folder.glob("index_*.json")), index_of(folder, PREFIX)][:1]
+        return [path for camera in cameras for path in camera._files()]
+
+    def save(self) -> None:
+        """Lists the frames in a file of their folder."""
+        index = {**asdict(self), "frames": [asdict(frame) for frame in self.taken]}
+        write_json(index_of(self.folder, self.prefix), {k: v for k, v in index.items() if k not in ("folder", "taken")})
+
+    def _files(self) -> list[Path]:
+        images = [*self.names, *([self.background] if self.is_still else [])]
+        return [index_of(self.folder, self.prefix), *(self.folder / f"{name}.png" for name in images)]
+
+    @property
+    def prefix(self) -> str:
+        """First part of the frames' names."""
+        return self.taken[0].name.rpartition("_")[0]
+
+    @property
+    def background(self) -> str:
+        """Name of the image of a camera that stands still without anything that moves."""
+        return f"{self.prefix}_background"
 
     @property
     def names(self) -> list[str]:
@@ -119,12 +157,22 @@ def check_selection(selection: Selection) -> None:
         )
 
 
-def take_frames(
-    source: Path, folder: Path, selection: Selection, quiet: bool = True, notes: list[str] | None = None
-) -> Frames:
-    """Writes the selected frames of a video or a folder as PNG, and frames.json, which lists them.
+def index_of(folder: Path, prefix: str) -> Path:
+    """The file that lists the frames of a camera."""
+    return folder / f"index_{prefix}.json"
 
-    Messages for the user are appended to ``notes``.
+
+def take_frames(
+    source: Path,
+    folder: Path,
+    selection: Selection,
+    quiet: bool = True,
+    notes: list[str] | None = None,
+    prefix: str = PREFIX,
+) -> Frames:
+    """Writes the selected frames of a video or a folder as PNG, and a file that lists them.
+
+    Messages for the user are appended to ``notes``; the names of the frames begin with the prefix.
 
     Raises:
         ValueError: If the source is missing, is not a video or folder of images, or has too few or different frames.
@@ -142,17 +190,43 @@ def take_frames(
     for found in images:
         size = size or found.image.shape[1::-1]
         image = _checked(found.image, f"{source}: {found.origin}", size, selection.longest_side)
-        taken.append(SourceFrame(f"frame_{len(taken):06d}", found.origin, found.step, found.time))
+        taken.append(SourceFrame(f"{prefix}_{len(taken):06d}", found.origin, found.step, found.time))
         write_png(folder / f"{taken[-1].name}.png", image)
     if len(taken) < MIN_FRAMES:
         raise ValueError(
             f"{source} gives {len(taken)} frame{'s' * (len(taken) != 1)}, at least {MIN_FRAMES} are needed"
         )
     height, width = image.shape[:2]
-    frames = [asdict(frame) for frame in taken]
-    factor = max(width, height) / found.longest_side
-    write_json(folder / INDEX, {"width": width, "height": height, "factor": factor, "frames": frames})
-    return Frames(folder, taken, width, height, factor)
+    frames = Frames(folder, taken, width, height, max(width, height) / found.longest_side, str(source))
+    frames.save()
+    return frames
+
+
+def take_videos(
+    sources: Sequence[Path],
+    folder: Path,
+    selection: Selection,
+    clock: Clock,
+    quiet: bool = True,
+    notes: list[str] | None = None,
+) -> list[Frames]:
+    """Writes the selected frames of several videos of one event, and of each camera that stands still its background.
+
+    The selection is from the time that all of them show; other arguments and errors as for ``take_frames``.
+    """
+    check_selection(selection)
+    digits, cameras = len(str(len(sources) - 1)), []
+    for k, source in enumerate(sources):
+        own = clock.selection(k, selection)
+        frames = take_frames(source, folder, own, quiet, notes, f"{k:0{digits}}")
+        later = round(1000 * clock.starts[k])
+        frames = replace(frames, taken=[replace(frame, time=frame.time + later) for frame in frames.taken])
+        if (background := find_background(folder, frames.names)) is not None:
+            frames = replace(frames, is_still=True)
+            write_png(folder / f"{frames.background}.png", background)
+        frames.save()
+        cameras.append(frames)
+    return cameras
 
 
 def _checked(image: np.ndarray, origin: str, size: tuple[int, int], longest_side: int) -> np.ndarray:

@@ -64,7 +64,7 @@ def read_video(source: Path, selection: Selection, quiet: bool, notes: list[str]
         ValueError: If it cannot be decoded, has too many frames, no rate, or none in the selected part.
     """
     require_file(source, MAX_BYTES)
-    stamps, nominal = _time_stamps(source, selection)
+    stamps, nominal = time_stamps(source, selection.fps is not None)
     timeline = plan_timeline(str(source), [stamp - stamps[0] for stamp in stamps], selection)
     cuts, decoded, best, current = CutFinder(), 0, (-1.0, Fraction(0), None), -1
     with _open(source) as (container, stream):
@@ -127,8 +127,12 @@ def _open(source: Path) -> Iterator[tuple[Any, Any]]:
         yield container, stream
 
 
-def _time_stamps(source: Path, selection: Selection) -> tuple[list[Fraction], int]:
-    """The time stamps of all frames [s], ascending, from the packets, and the number of frames that the file states."""
+def time_stamps(source: Path, needs_rate: bool = False) -> tuple[list[Fraction], int]:
+    """The time stamps of all frames [s], ascending, from the packets, and the number of frames that the file states.
+
+    Raises:
+        ValueError: If it is not a video, has no frames, or neither time stamps nor the rate that it ``needs_rate``.
+    """
     with _open(source) as (container, stream):
         stamps: list[Fraction | None] = []
         with suppress(av.FFmpegError):  # the packets before the damage are used
@@ -141,7 +145,7 @@ def _time_stamps(source: Path, selection: Selection) -> tuple[list[Fraction], in
         rate = stream.average_rate
         if not stamps:
             raise ValueError(f"{source} is not a video that can be decoded: it has no frames")
-        if not rate and selection.fps is not None:
+        if not rate and needs_rate:
             raise ValueError(f"{source} has no frame rate: use --count instead of --fps")
         return [Fraction(k) / (Fraction(str(rate)) if rate else 1) for k in range(len(stamps))], stream.frames
 

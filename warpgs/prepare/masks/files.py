@@ -1,6 +1,6 @@
 """The files that a preparation keeps its masks in."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,14 +53,21 @@ def mask_files(folder: Path, names: Sequence[str]) -> list[Path]:
     return [folder / INDEX, *(folder / f"{name}.png.png" for name in names)]
 
 
-def write_masks(folder: Path, names: Sequence[str], dynamic: Sequence[Bool[np.ndarray, "H W"]]) -> str:
+def write_masks(folder: Path, cameras: Iterable[tuple[Sequence[str], Sequence[Bool[np.ndarray, "H W"]]]]) -> str:
     """Writes the masks of the frames; returns a summary.
+
+    Args:
+        folder: Folder of the files.
+        cameras: Names of each camera's frames, and their [H, W] dynamic masks.
 
     Raises:
         OSError: If a file cannot be written; the message names it.
     """
-    for name, mask in zip(names, dynamic, strict=True):
-        write_png(folder / f"{name}.png.png", (~mask).astype(np.uint8) * 255)
-    fraction = float(np.mean([mask.mean() for mask in dynamic]))
+    fractions = []
+    for names, dynamic in cameras:
+        for name, mask in zip(names, dynamic, strict=True):
+            write_png(folder / f"{name}.png.png", (~mask).astype(np.uint8) * 255)
+            fractions.append(mask.mean())
+    fraction = float(np.mean(fractions))
     write_json(folder / INDEX, {"dynamic_fraction": fraction})
     return f"{fraction:.1%} of the pixels move"

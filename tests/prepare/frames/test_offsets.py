@@ -1,0 +1,103 @@
+"""When several videos start, from their sound or as given."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.prepare import event
+from warpgs.prepare.frames.offsets import Clock, check_offsets, common_clock
+from warpgs.prepare.options import Options, Selection
+
+SECONDS = 6.0
+"""Length of the videos."""
+
+IMAGES = [np.full((16, 16, 3), 40 * k % 256, np.uint8) for k in range(int(SECONDS * event.RATE))]
+
+
+def write(path: Path, start: float, *, seed: int | None = 0, rate: int = 48_000, gain: float = 0.5) -> Path:
+    """A video that hears an event from this time on; without a seed, it has no sound."""
+    if seed is None:
+        return event.write_video(path, IMAGES)
+    return event.write_video(path, IMAGES, event.heard(event.sound(seed), start, SECONDS, rate, gain), rate)
+
+
+def test_sound_tells_when_videos_start_whatever_their_gain_noise_and_rate(tmp_path):
+    videos = [
+        write(tmp_path / "a.mp4", 3.0),
+        write(tmp_path / "b.mp4", 3.37, rate=44_100, gain=0.1),
+        write(tmp_path / "c.mp4", 1.5, rate=16_000, gain=0.3),
+    ]
+    clock, note = common_clock(videos, None)
+    assert np.allclose(clock.starts, [1.5, 1.87, 0.0], atol=0.002)
+    assert clock.begin == clock.starts[1]
+    assert clock.end == pytest.approx(SECONDS - 1 / event.RATE)
+    assert note == "the videos start at a.mp4 1.500 s, b.mp4 1.870 s, c.mp4 0.000 s, from their sound"
+
+
+def test_sound_that_begins_later_than_the_images_is_heard_later(tmp_path):
+    late = event.heard(event.sound(), 4.0, SECONDS - 1.0)
+    b = event.write_video(tmp_path / "b.mp4", IMAGES, late, sound_from=1.0)
+    assert common_clock([write(tmp_path / "a.mp4", 3.0), b], None)[0].starts == pytest.approx([0.0, 0.0], abs=0.002)
+
+
+def test_a_video_is_placed_by_another_one_than_the_first(tmp_path):
+    """The first and the last have nothing in common but the one between them."""
+    videos = [write(tmp_path / f"{k}.mp4", start) for k, start in enumerate((2.0, 5.0, 8.0))]
+    with pytest.raises(ValueError, match=r"2\.mp4 starts 6\.00 s after .*0\.mp4, which takes only 5\.88 s: they have"):
+        common_clock(videos, None)
+
+
+@pytest.mark.parametrize(
+    ("seed", "message"),
+    [
+        (None, r"c\.mp4 has no sound, which tells when it starts: give .* with --offset, such as --offset 0,0\.37"),
+        (5, r"the sound of .*c\.mp4 does not tell when it starts \(found: a\.mp4 0\.00 s, b\.mp4 0\.37 s\): give"),
+    ],
+)
+def test_a_video_whose_sound_does_not_tell_when_it_starts_is_named(tmp_path, seed, message):
+    videos = [write(tmp_path / "a.mp4", 3.0), write(tmp_path / "b.mp4", 3.37), write(tmp_path / "c.mp4", 3, seed=seed)]
+    with pytest.raises(ValueError, match=message):
+        common_clock(videos, None)
+
+
+def test_silence_is_no_sound(tmp_path):
+    silent = event.write_video(tmp_path / "b.mp4", IMAGES, np.zeros(48_000 * 6))
+    with pytest.raises(ValueError, match=r"b\.mp4 has no sound"):
+        common_clock([write(tmp_path / "a.mp4", 3.0), silent], None)
+
+
+def test_given_offsets_need_no_sound_and_only_their_differences_count(tmp_path):
+    videos = [write(tmp_path / "a.mp4", 0, seed=None), write(tmp_path / "b.mp4", 0, seed=None)]
+    clock, note = common_clock(videos, [2.0, 0.5])
+    assert clock.starts == [1.5, 0.0]
+    assert note.endswith("as given")
+
+
+def test_given_offsets_larger_than_a_video_are_refused(tmp_path):
+    videos = [write(tmp_path / "a.mp4", 0, seed=None), write(tmp_path / "b.mp4", 0, seed=None)]
+    with pytest.raises(ValueError, match=r"b\.mp4 starts 7\.00 s after .*a\.mp4, which takes only 5\.88 s: they have"):
+        common_clock(videos, [0.0, 7.0])
+
+
+def test_a_part_is_taken_of_the_time_that_all_videos_show():
+    clock = Clock([0.0, 1.5], begin=1.5, end=6.0)
+    first, second = (clock.selection(k, Selection(start=1.0, end=3.0)) for k in (0, 1))
+    assert (first.start, first.end) == pytest.approx((2.5, 4.5), abs=1e-5)
+    assert (second.start, second.end) == pytest.approx((1.0, 3.0), abs=1e-5)
+    with pytest.raises(ValueError, match=r"the videos show 4\.5 s together: no frame is in the part from --start on"):
+        clock.selection(0, Selection(start=5.0))
+
+
+@pytest.mark.parametrize(
+    ("offset", "count", "message"),
+    [
+        ("0,x", 2, "--offset must be numbers of seconds, separated by commas, got 0,x"),
+        ("0,1,2", 2, "--offset must be a time for each of the 2 videos, separated by commas, got 0,1,2"),
+        ("0,inf", 2, "--offset must be a time for each of the 2 videos"),
+        ("0", 1, "--offset is for several videos"),
+    ],
+)
+def test_offsets_that_are_no_times_are_refused(offset, count, message):
+    with pytest.raises(ValueError, match=message):
+        check_offsets(Options(offset=offset).offsets, count)
