@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from .distortion import Distortion
     from .model.splats import Splats
     from .rendering import render
+    from .runs.opening import open_run
     from .runs.progress import Progress
-    from .runs.run import open_run
     from .training.train import train
 
     __version__: str
@@ -52,7 +52,7 @@ _HOMES = {
     "RenderSettings": "config",
     "Splats": "model.splats",
     "load_capture": "captures.opening",
-    "open_run": "runs.run",
+    "open_run": "runs.opening",
     "render": "rendering",
     "train": "training.train",
 }

@@ -30,7 +30,7 @@ from warpgs.evaluation.lpips import Lpips
 from warpgs.files import write_json
 from warpgs.rendering import Layer, Rendering
 from warpgs.runs import checkpoint
-from warpgs.runs.run import open_run
+from warpgs.runs.opening import open_run
 from warpgs.runs.trained import TrainedScene
 from warpgs.training.train import train
 from warpgs.video.camera_paths import training_path

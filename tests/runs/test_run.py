@@ -16,7 +16,8 @@ from warpgs.locks import lock_folder
 from warpgs.runs import checkpoint
 from warpgs.runs import run as runs
 from warpgs.runs.config_file import read_config, read_notes, write_start
-from warpgs.runs.run import Run, locked_new_folder, new_folder, open_run
+from warpgs.runs.opening import open_run
+from warpgs.runs.run import Run, locked_new_folder, new_folder
 from warpgs.runtime.devices import choose_device
 
 UNUSUAL = dataclasses.replace(

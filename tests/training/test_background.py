@@ -21,7 +21,8 @@ from warpgs.files import write_png
 from warpgs.initialization import plan as module
 from warpgs.initialization.plan import make_plan, mean_color
 from warpgs.rendering import Layer
-from warpgs.runs.run import Run, open_run
+from warpgs.runs.opening import open_run
+from warpgs.runs.run import Run
 from warpgs.synthetic.balls import BallsSize, balls_capture
 from warpgs.training.command import parse
 from warpgs.training.train import make_trainer, train

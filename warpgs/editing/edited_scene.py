@@ -72,6 +72,8 @@ def edited(scene: TrainedScene, edits: Edits, capture: Capture | None = None, qu
         ValueError: If an edit is out of its range, removes all Gaussians, or needs a capture.
     """
     check(edits)
+    if scene.varies and edits != Edits():
+        raise ValueError("a sequence of files cannot be edited: edit its files one by one")
     if edits.crop is not None or edits.min_opacity is not None:
         scene = _kept(scene, _inside_and_opaque(scene, edits))
     if not edits.drop_floaters and (edits.max_gaussians is None or _number(scene) <= edits.max_gaussians):

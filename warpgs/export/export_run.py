@@ -5,7 +5,10 @@ import math
 
 from warpgs.data.capture import background_color
 from warpgs.errors import not_one_of
+from warpgs.runs.opening import open_scene
 from warpgs.runs.run import Run
+from warpgs.runs.scene_file import SceneFile, SceneSequence
+from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import MAX_FRAMES
 
 from .camera_writers import CAMERA_FORMATS, CameraSet, write_cameras
@@ -35,9 +38,10 @@ def export_run(options: Export) -> str:
     _check_format(options)
     _check_out(options)
     _check_values(options)
-    run = Run.open(options.run_folder, "cpu", options.data)
+    run = open_scene(options.run_folder, "cpu", options.data)
     job, writer = Job(run, options), WRITERS[options.format]
-    if not writer.has_background:
+    _check_sequence(job.clouds.scene, options)
+    if not writer.has_background and not isinstance(run, SceneFile):
         job.notes.append(_background_note(run))
     if job.clouds.scene.scene.light is not None:
         job.notes.append(REFLECTIONS_NOTE)
@@ -95,6 +99,13 @@ def _check_out(options: Export) -> None:
     if options.frames is not None or options.layers == "apart":
         several = "--layers apart" if options.frames is None else "--frames"
         raise ValueError(f"{several} writes several files: --out must be a folder, not a file as {out}")
+
+
+def _check_sequence(scene: TrainedScene, options: Export) -> None:
+    """Refuses to write a file that moves of a sequence of files that have other Gaussians at other times."""
+    moves = "frames" not in WRITERS[options.format].options
+    if moves and isinstance(scene, SceneSequence) and not scene.has_same_gaussians():
+        raise ValueError(f"--format {options.format} needs the same number of Gaussians in all files of a sequence")
 
 
 def _check_values(options: Export) -> None:

@@ -44,7 +44,7 @@ class Job:
     @property
     def folder(self) -> Path:
         """The output folder."""
-        return self.options.out or self.options.run_folder / "export"
+        return self.options.out or self.run.folder / "export"
 
     def file(self, name: str) -> Path:
         """Where a file of this name is written: ``--out`` if that ends as it does, else in the output folder."""

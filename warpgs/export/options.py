@@ -15,7 +15,8 @@ class Export:
     """Exports the newest checkpoint of a run for other programs, at one time or moving."""
 
     run_folder: RunFolder
-    """Run folder."""
+    """Run folder; or a file of Gaussians of another program (.ply, .sog, .spz, .glb, .splat), or a folder of such files
+    over time."""
     format: str = "ply"
     """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. sog: SOG of PlayCanvas.
     spz: SPZ of Niantic, version 4. spz3: SPZ, version 3. glb: binary glTF (KHR_gaussian_splatting). usd: OpenUSD with

@@ -1,8 +1,6 @@
 """Run folders: opened and created; docs/run-folder.md lists their files."""
 
 import dataclasses
-import os
-import reprlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -109,6 +107,11 @@ class Run:
         return Run(folder, config)
 
     @property
+    def has_capture(self) -> bool:
+        """Whether a capture is known."""
+        return True
+
+    @property
     def device(self) -> torch.device:
         return torch.device(self.config.device)
 
@@ -190,18 +193,3 @@ class Run:
     def lock(self) -> AbstractContextManager[None]:
         """Locks the folder against other training processes; raises as ``lock_folder``."""
         return lock_folder(self.folder, TRAINED)
-
-
-def open_run(folder: Path | str, device: Device | None = None) -> TrainedScene:
-    """The trained scene of a run folder: ``open_run("runs/builtin-quick").render(camera)``.
-
-    Args:
-        folder: Run folder.
-        device: Device to render on; CUDA if None and there is a GPU.
-
-    Raises:
-        ValueError: If the folder is not a run folder, has no checkpoint or is damaged.
-    """
-    if not isinstance(folder, str | os.PathLike):
-        raise ValueError(f"a run is opened by the path of its folder, got {reprlib.repr(folder)}")
-    return Run.open(Path(folder), device).trained_scene()

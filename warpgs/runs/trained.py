@@ -52,8 +52,11 @@ class TrainedScene:
         metadata: Of the checkpoint: which networks are in use, and the degree of spherical harmonics.
 
     Attributes:
+        varies: Whether it has other Gaussians at other times, so that ``scene`` are not all.
         background (Tensor | None): [3] colour behind all Gaussians, on the scene's device; None is black.
     """
+
+    varies = False
 
     def __init__(self, scene: SplitScene, config: Plan, metadata: Metadata) -> None:
         self.scene, self.config, self.metadata = scene, config, metadata

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from warpgs.cameras import Camera, intrinsic_matrix
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Frame
 
 SMOOTHING = 0.02
 """Standard deviation of the Gaussian filter over the training camera's path, as a fraction of the path's length."""
@@ -119,6 +119,23 @@ def default_camera(sphere: BoundingSphere, side: tuple[float, float] = (0.0, -1.
     )
     focal = DEFAULT_FOCAL * DEFAULT_SIZE[1]
     return Camera.looking_at(position, sphere.center, torch.tensor(UP, dtype=torch.float32), focal, DEFAULT_SIZE, time)
+
+
+def default_capture(means: Float[Tensor, "N 3"], name: str) -> Capture:
+    """A capture without images whose cameras see a scene from the left, the front and the right, with y pointing down.
+
+    Args:
+        means: Centres of the Gaussians [scene units].
+        name: Name of the capture.
+    """
+    sphere, sides = BoundingSphere.around(means), {"left": (-1.0, 0.0), "front": (0.0, -1.0), "right": (1.0, 0.0)}
+    times = evenly_spaced(len(sides))
+    cameras = {view: default_camera(sphere, sides[view], time) for view, time in zip(sides, times, strict=True)}
+
+    def read(view: str) -> Frame:
+        raise ValueError(f"{name} has no image of {view}")
+
+    return Capture(name, cameras, [*sides], [], means[:: max(1, len(means) // MAX_MEANS)], None, read)
 
 
 def at_times(camera: Camera, times: Sequence[float]) -> list[Camera]:

@@ -21,10 +21,12 @@ class Render:
     """Renders a run's newest checkpoint to images and a video."""
 
     run_folder: RunFolder
-    """Run folder."""
+    """Run folder; or a file of Gaussians of another program (.ply, .sog, .spz, .glb, .splat), or a folder of such files
+    over time."""
     path: PathName | None = None
     """Camera path: the evaluation views (default); a fixed camera over time; the training camera's path at one fixed
-    time; the same path over time; a spiral around the middle view; bullet time, which stops on the same path."""
+    time; the same path over time; a spiral around the middle view (default of files); bullet time, which stops on the
+    same path."""
     keyframes: Path | None = None
     """JSON file of keyframes to follow instead (docs/viewing.md)."""
     cameras: Path | None = None

@@ -15,9 +15,10 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, missing_view
 from warpgs.editing.edited_scene import with_edits
 from warpgs.files import remove_numbered, write_png
+from warpgs.runs.opening import open_scene
 from warpgs.runs.run import Run
 
-from . import camera_paths, given_cameras, keyframes, writer
+from . import camera_paths, keyframes, writer
 from .encodings import ENCODINGS
 from .frames import COLORED, render_frames
 from .options import Render
@@ -48,11 +49,13 @@ def render_run(options: Render) -> str:
         ValueError: If the run, its capture, the camera path or an option is not valid.
         OSError: If a file cannot be written.
     """
+    run = open_scene(options.run_folder, options.device, options.data)
+    if not run.has_capture and options.path_name == "views":
+        options = dataclasses.replace(options, path="spiral")
     _check(options)
-    run = Run.open(options.run_folder, options.device, options.data)
-    opened = cache(partial(run.open_corrected_capture, options.quiet))
+    opened = cache(partial(_opened_capture, run, options.quiet))
     scene, notes = with_edits(run.trained_scene(), run.folder, options.editing, opened, options.quiet)
-    capture = opened()
+    capture = opened() or camera_paths.default_capture(scene.splats(0.5).means.cpu(), run.folder.name)
     means = scene.splats(_time(options)).means.cpu()
     dynamic = means[len(scene.scene.static) :]
     centers = torch.stack([capture.cameras[name].position for name in capture.train])
@@ -63,9 +66,14 @@ def render_run(options: Render) -> str:
     given = options.keyframes or options.cameras
     camera_paths.BoundingSphere.around(means, centers).check(cameras, str(given or options.path_name))
     name = given.stem if given else options.path_name
-    folder = options.out or options.run_folder / "render" / name
+    folder = options.out or run.folder / "render" / name
     summary = _write(options, folder, names, render_frames(options, capture, scene, cameras, names))
     return "\n".join([summary, *notes])
+
+
+def _opened_capture(run: Run, quiet: bool) -> Capture | None:
+    """The capture of a run; None if it has none, as files of other programs."""
+    return run.open_corrected_capture(quiet) if run.has_capture else None
 
 
 def _check(options: Render) -> None:
@@ -115,7 +123,9 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
     if options.keyframes is not None:
         return _numbered(keyframes.read_path(options.keyframes, capture, frames))
     if options.cameras is not None:
-        return _numbered(given_cameras.read_cameras(options.cameras, capture))
+        from .given_cameras import read_cameras  # imports loaders
+
+        return _numbered(read_cameras(options.cameras, capture))
     if options.path_name == "views":
         if not capture.val:
             raise ValueError(f"{capture.name} has no evaluation views; choose another --path")

@@ -14,7 +14,8 @@ class View:
     """Shows a run in the browser: move through space and time, switch layers, look through the training cameras."""
 
     run_folder: RunFolder
-    """Run folder."""
+    """Run folder; or a file of Gaussians of another program (.ply, .sog, .spz, .glb, .splat), or a folder of such files
+    over time."""
     host: str = "127.0.0.1"
     """Address to listen on. By default only this machine can connect; 0.0.0.0 accepts connections from everywhere."""
     port: int = 8080

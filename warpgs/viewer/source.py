@@ -11,6 +11,7 @@ from warpgs.editing.edited_scene import with_edits
 from warpgs.editing.options import Editing
 from warpgs.errors import one_line
 from warpgs.runs import preview
+from warpgs.runs.opening import open_scene
 from warpgs.runs.run import Device, Run
 from warpgs.runs.trained import TrainedScene
 
@@ -111,9 +112,9 @@ def _described(state: preview.State) -> str:
 
 
 def open_source(folder: Path, device: Device | None, follow: bool) -> Source:
-    """The source of a run folder, rendered on CUDA if ``device`` is None and there is a GPU.
+    """The source of a run folder, or of files as of ``open_scene``; on CUDA if ``device`` is None and there is a GPU.
 
     Raises:
         ValueError: If the folder is not a run folder, is damaged, has no checkpoint, or there is no such device.
     """
-    return Source(Run.open(folder, device), follow)
+    return Source(Run.open(folder, device) if follow else open_scene(folder, device), follow)
