@@ -222,8 +222,63 @@ def test_a_camera_that_stays_at_one_place_gives_no_depth_by_optical_flow(root, p
     (root / "points.npy").unlink()
     for path in (root / "camera").iterdir():
         edit_json(path, position=[0.1, 0.2, 0.3])
-    with pytest.raises(ValueError, match="all cameras are at one place"):
+    with pytest.raises(ValueError, match="each camera stays at one place"):
         add_parts(root, AddOptions([part]))
+
+
+def add_still_camera(root):
+    """Adds a second camera that stands still, with smaller images between the times of the first."""
+    index, metadata = (json.loads((root / f"{name}.json").read_text()) for name in ("dataset", "metadata"))
+    shots = boards.record(COUNT, path=boards.still_pose)[0]
+    for k, shot in enumerate(shots):
+        name = f"other{k:03d}"
+        for factor in (1, 2):
+            small = cv2.resize(shot, (128 // factor, 96 // factor), interpolation=cv2.INTER_AREA)
+            captures.write_png(root / f"rgb/{factor}x/{name}.png", small)
+        fields = {"orientation": np.eye(3).tolist(), "position": [0.0, 0.0, 0.0], "focal_length": boards.FOCAL / 2}
+        shutil.copy(root / f"camera/{NAMES[k]}.json", root / f"camera/{name}.json")
+        edit_json(root / f"camera/{name}.json", **fields, principal_point=[64.0, 48.0], image_size=[128, 96])
+        metadata[name] = {"time_id": k + 0.4, "camera_id": 1}
+        index["train_ids"].append(name)
+    captures.write_json(root / "dataset.json", index)
+    captures.write_json(root / "metadata.json", metadata)
+
+
+def test_masks_of_several_cameras_are_found_in_each_by_itself(root, monkeypatch):
+    add_still_camera(root)
+    seen = []
+
+    def find(frames, weights, quiet):
+        seen.append((len(frames.images), frames.stand_still))
+        return [is_red(image) for image in frames.images]
+
+    monkeypatch.setitem(methods.MASKERS, "red", Masker(find))
+    add_parts(root, AddOptions(["masks"], masks="red"))
+    assert seen == [(COUNT, False), (COUNT, True)]
+    for name in (NAMES[4], "other004"):
+        assert boards.overlap(written_mask(root, name), red_part(root, name)) > 0.85
+    assert cv2.imread(str(root / "masks.png")).shape[:2] == (4 * 192, 6 * 256)
+
+
+def test_depth_by_flow_is_added_to_the_cameras_that_move(root):
+    add_still_camera(root)
+    lines = []
+    add_parts(root, AddOptions(["depth"]), lines.append)
+    assert lines[0].startswith(f"depth: {COUNT} frames, known on ")
+    assert {path.stem for path in (root / "depth/1x").iterdir()} == {*NAMES}
+    add_parts(root, AddOptions(["depth"]), lines.append)
+    assert lines[1] == "depth: all frames of cameras that move have it"
+
+
+def test_too_few_frames_of_one_of_several_cameras_are_refused(root):
+    add_still_camera(root)
+    index = json.loads((root / "dataset.json").read_text())
+    edit_json(
+        root / "dataset.json",
+        train_ids=[n for n in index["train_ids"] if n not in ("other003", "other004", "other005")],
+    )
+    with pytest.raises(ValueError, match="9 frames of the camera of other000 are too few to find what moves"):
+        add_parts(root, AddOptions(["masks"], masks="red"))
 
 
 def test_a_hypernerf_capture_stays_one(tmp_path):
@@ -233,7 +288,7 @@ def test_a_hypernerf_capture_stays_one(tmp_path):
     more = {f"left_{k:06d}": k for k in range(4, 12)}
     metadata = json.loads((root / "metadata.json").read_text())
     for name, k in more.items():
-        metadata[name] = {"time_id": k}
+        metadata[name] = {"time_id": k, "camera_id": 0}
         captures.write_json(root / f"camera/{name}.json", captures.camera_fields(k))
         for size in ("1x", "2x"):
             shutil.copy(root / f"rgb/{size}/left_000000.png", root / f"rgb/{size}/{name}.png")

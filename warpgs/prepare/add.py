@@ -1,7 +1,7 @@
 """Adds what a capture lacks, with its own cameras: masks, depth, points.
 
-The methods of ``MASKERS`` and ``DEPTHS`` work on frames of one lens. If those of a capture have lenses of their own,
-they are resampled to one pinhole camera, and results to each frame as its file has it.
+The methods of ``MASKERS`` and ``DEPTHS`` work on the frames of one camera, with one lens. If these have lenses of their
+own, they are resampled to one pinhole camera, and results to each frame as its file has it.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,6 +17,7 @@ from warpgs.captures.opening import load_capture
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.camera_files import read_camera
+from warpgs.data.camera_ids import with_camera_ids
 from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.images import decode, is_bright, read_mask
@@ -30,13 +31,13 @@ from warpgs.files import read_json, write_json
 from warpgs.locks import lock_folder
 
 from .cameras.posed_frames import PosedFrames, pixel_rays
-from .cameras.recovered import are_apart, camera_centers
+from .cameras.recovered import are_apart
 from .checks import MIN_FOR_MOTION
 from .contact_sheet import choose_evenly, colored_depth, overlay_mask, write_contact_sheet
 from .depth.estimate import MAX_SIDE, as_half
 from .depth.methods import DEPTHS
 from .frames.images import resize_to_side
-from .masks.masker import WORKING_SIDE
+from .masks.masker import WORKING_SIDE, DynamicMasks
 from .masks.methods import MASKERS
 from .weights import find_weights
 
@@ -86,7 +87,7 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     if not isinstance(loader, NerfiesLoader):
         raise ValueError(f"{root} has the layout {layout}: first copy it with warpgs import, then add to the copy")
     with lock_folder(root, "prepared"):
-        capture = loader.load(root, LoadOptions(), incomplete_masks=True)
+        capture = with_camera_ids(loader.load(root, LoadOptions(), incomplete_masks=True))
         job = _Job(root, layout, loader.default_factor, capture, read_units(root / "scene.json"), options, log)
         for part in PARTS:
             if part in options.parts:
@@ -112,7 +113,11 @@ class _Depth(NamedTuple):
 
 @dataclass(frozen=True)
 class _Job:
-    """One call of ``add_parts``; ``posed`` holds frames by their resize factor, ``estimated`` depth by the method."""
+    """One call of ``add_parts``.
+
+    ``posed`` holds a camera's frames by the first of them and their resize factor, ``estimated`` depth by the first
+    frame and the method.
+    """
 
     root: Path
     layout: str
@@ -121,12 +126,13 @@ class _Job:
     units: SceneUnits
     options: AddOptions
     log: Callable[[str], None] | None
-    posed: dict[float, PosedFrames] = field(default_factory=dict)
-    estimated: dict[str, _Depth] = field(default_factory=dict)
+    posed: dict[tuple[str, float], PosedFrames] = field(default_factory=dict)
+    estimated: dict[tuple[str, str], _Depth] = field(default_factory=dict)
 
     def add_masks(self) -> None:
         """Writes masks of the frames that lack them, and masks.png."""
-        names = self._names()
+        videos = self._videos()
+        names = [name for video in videos for name in video]
         # The loader reads one of the two folders: those in mask/ would be lost to it if new ones went to the other.
         folder = self._mask_folder()
         files = {name: self._mask_files(folder, name) for name in names}
@@ -141,31 +147,40 @@ class _Job:
         if not missing:
             self._say("masks: all frames have them")
             return
-        if len(names) < MIN_FOR_MOTION:
-            raise ValueError(
-                f"{len(names)} frames are too few to find what moves, at least {MIN_FOR_MOTION} are needed"
-            )
-        self._estimate_masks(names, missing)
+        lacking = [video for video in videos if not set(video).isdisjoint(missing)]
+        for video in lacking:
+            if len(video) < MIN_FOR_MOTION:
+                whose = f" of the camera of {video[0]}" if len(videos) > 1 else ""
+                raise ValueError(
+                    f"{len(video)} frames{whose} are too few to find what moves, at least {MIN_FOR_MOTION} are needed"
+                )
+        sheets, fractions = [], list[float]()
+        for video in lacking:
+            masks = self._estimate_masks(video, set(missing))
+            images = self._posed(video, WORKING_SIDE).images
+            shown = choose_evenly(len(video), len(lacking))
+            sheets.append({video[k]: overlay_mask(images[k], masks[k]) for k in shown})
+            fractions += [float(mask.mean()) for mask in masks]
+        write_contact_sheet(self.root / "masks.png", sheets)
+        fraction = np.mean(fractions)
+        self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
 
-    def _estimate_masks(self, names: list[str], missing: list[str]) -> None:
-        """Writes masks of the ``missing`` ones of some frames, as all of these together show them."""
+    def _estimate_masks(self, video: list[str], missing: set[str]) -> DynamicMasks:
+        """The masks of a camera's frames, of which those of the ``missing`` ones are written."""
         method = MASKERS[self.options.masks]
         assert method is not None
         folder = find_weights(method.network, self.options.weights)
-        frames = self._posed(names, WORKING_SIDE)
+        frames = self._posed(video, WORKING_SIDE)
         if {"depth", "points"} & set(self.options.parts):
             frames.halved.triangulated = {}
         masks = method.find(frames, folder, self.log is None)
-        self._keep_layout({} if set(missing).isdisjoint(self.capture.train) else {"masks": writer.ESTIMATED})
-        for name, mask in zip(names, masks, strict=True):
+        self._keep_layout({} if missing.isdisjoint(self.capture.train) else {"masks": writer.ESTIMATED})
+        for name, mask in zip(video, masks, strict=True):
             if name in missing:
                 lens = self._lens(name)
                 dynamic = _resampled(mask.astype(np.float32), frames.lens, lens, cv2.INTER_LINEAR) > 0.5
                 writer.write_mask(self.root, name, ~dynamic, self._factors())
-        shown = {names[k]: overlay_mask(frames.images[k], masks[k]) for k in choose_evenly(len(names))}
-        write_contact_sheet(self.root / "masks.png", [shown])
-        fraction = float(np.mean([mask.mean() for mask in masks]))
-        self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
+        return masks
 
     def _keep_layout(self, entries: dict[str, str]) -> None:
         """Names the layout in dataset.json, because masks in full size make another dataset of it, and adds entries.
@@ -210,69 +225,98 @@ class _Job:
         if self.layout == "iphone":
             self._say("depth: that of the sensor stays")
             return
-        names = self._names()
-        missing = [name for name in names if find_depth(self.root, self.factor, name) is None]
+        videos = self._videos()
+        missing = {name for video in videos for name in video if find_depth(self.root, self.factor, name) is None}
         if not missing:
             self._say("depth: all frames have it")
             return
-        frames, _, planes = self._depth(names)
-        for name, plane in zip(names, planes, strict=True):
-            if name in missing:
-                lens = self._lens(name)
-                lens = lens.resized(frames.lens.width, round(frames.lens.width * lens.height / lens.width))
-                writer.write_depth(self.root, name, as_half(_resampled(plane, frames.lens, lens, cv2.INTER_NEAREST)))
-        shown = {names[k]: colored_depth(planes[k]) for k in choose_evenly(len(names))}
-        write_contact_sheet(self.root / "depth.png", [shown])
-        known = float(np.mean([np.isfinite(plane).mean() for plane in planes]))
-        self._say(f"depth: {len(missing)} frames, known on {known:.0%} of the pixels: look at depth.png")
+        chosen = [video for video in self._seen_apart(videos, self.options.depth) if not missing.isdisjoint(video)]
+        sheets, known = [], list[float]()
+        for video in chosen:
+            frames, _, planes = self._depth(video, self.options.depth)
+            for name, plane in zip(video, planes, strict=True):
+                if name in missing:
+                    lens = self._lens(name)
+                    lens = lens.resized(frames.lens.width, round(frames.lens.width * lens.height / lens.width))
+                    resampled = _resampled(plane, frames.lens, lens, cv2.INTER_NEAREST)
+                    writer.write_depth(self.root, name, as_half(resampled))
+            shown = choose_evenly(len(video), len(chosen))
+            sheets.append({video[k]: colored_depth(planes[k]) for k in shown})
+            known += [float(np.isfinite(plane).mean()) for plane in planes]
+        if not chosen:
+            self._say("depth: all frames of cameras that move have it")
+            return
+        write_contact_sheet(self.root / "depth.png", sheets)
+        count = len(missing & {name for video in chosen for name in video})
+        self._say(f"depth: {count} frames, known on {np.mean(known):.0%} of the pixels: look at depth.png")
 
     def add_points(self) -> None:
         """Writes points.npy and point_colors.npy, from optical flow, if the capture has no points."""
         if len(self.capture.points):
             self._say(f"points: {len(self.capture.points)} are there")
             return
-        names = self._names()
-        frames, static, planes = self._depth(names, "flow")
-        chosen = evenly_spaced_indices(len(names), MAX_POINT_FRAMES)
-        views = [DepthView(frames.images[k], planes[k], static[k], frames.lens, frames.poses[k]) for k in chosen]
+        videos, views = self._seen_apart(self._videos(), "flow"), []
+        for video in videos:
+            frames, static, planes = self._depth(video, "flow")
+            views += [
+                DepthView(frames.images[k], planes[k], static[k], frames.lens, frames.poses[k])
+                for k in evenly_spaced_indices(len(video), max(1, MAX_POINT_FRAMES // len(videos)))
+            ]
         points, colors = points_of_views(views)
         if len(points) == 0:
             raise ValueError(f"{self.root}: no points were found: the camera hardly moves, or its poses are wrong")
         writer.write_points(self.root, points / self.units.scale + self.units.center, colors)
         self._say(f"points: {len(points)}")
 
-    def _depth(self, names: list[str], depth: str | None = None) -> _Depth:
-        """The depth of frames at working size; the same for depth and points."""
-        name = depth or self.options.depth
-        if name in self.estimated:
-            return self.estimated[name]
-        method = DEPTHS[name]
-        assert method is not None
-        folder = find_weights(method.network, self.options.weights)
-        frames = self._posed(names, MAX_SIDE, max_factor=1.0)
-        if name == "flow" and not are_apart(camera_centers(frames.poses)):
-            raise ValueError(f"{self.root}: all cameras are at one place, where optical flow says nothing about depth")
-        static = self._static(names, frames.lens)
-        planes = method.estimate(frames, [~mask for mask in static], folder, self.log is None)
-        self.estimated[name] = _Depth(frames, static, planes)
-        return self.estimated[name]
+    def _depth(self, video: list[str], depth: str) -> _Depth:
+        """The depth of a camera's frames at working size; the same for depth and points."""
+        key = video[0], depth
+        if key not in self.estimated:
+            method = DEPTHS[depth]
+            assert method is not None
+            folder = find_weights(method.network, self.options.weights)
+            frames = self._posed(video, MAX_SIDE, max_factor=1.0)
+            static = self._static(video, frames.lens)
+            planes = method.estimate(frames, [~mask for mask in static], folder, self.log is None)
+            self.estimated[key] = _Depth(frames, static, planes)
+        return self.estimated[key]
 
-    def _names(self) -> list[str]:
-        """Training frames, and evaluation frames at times of their own (not those of another camera), by time."""
-        cameras = self.capture.cameras
-        trained = {cameras[name].time for name in self.capture.train}
-        names = [*self.capture.train, *(name for name in self.capture.val if cameras[name].time not in trained)]
-        return self.capture.in_time(names)
+    def _seen_apart(self, videos: list[list[str]], depth: str) -> list[list[str]]:
+        """The videos that a method can estimate the depth of: those of cameras that move, if it needs parallax.
+
+        Raises:
+            ValueError: If there are none.
+        """
+        method = DEPTHS[depth]
+        assert method is not None
+        found = [video for video in videos if not method.needs_parallax or are_apart(self._centers(video))]
+        if not found:
+            raise ValueError(
+                f"{self.root}: each camera stays at one place, where optical flow says nothing about depth"
+            )
+        return found
+
+    def _centers(self, names: list[str]) -> Float[np.ndarray, "F 3"]:
+        return np.array([self.capture.cameras[name].position.double().numpy() for name in names])
+
+    def _videos(self) -> list[list[str]]:
+        """The frames of each camera that trains, by time; its evaluation frames are at times of their own."""
+        cameras, train = self.capture.cameras, {*self.capture.train}
+        videos = []
+        for frames in self.capture.by_camera([*self.capture.train, *self.capture.val]).values():
+            times = {cameras[name].time for name in frames if name in train}
+            videos.append([name for name in frames if name in train or cameras[name].time not in times])
+        return [video for video in videos if not train.isdisjoint(video)]
 
     def _posed(self, names: list[str], side: int, max_factor: float = np.inf) -> PosedFrames:
         """The frames as one lens sees them, with the longer side resized to ``side``."""
         sizes = {self.capture.cameras[name].size for name in names}
         if len(sizes) > 1:
-            raise ValueError(f"{self.root} has images of several sizes, which cannot be compared")
-        factor = min(max_factor, side / max(sizes.pop()))
-        if factor not in self.posed:
-            self.posed[factor] = self._resized(names, side, max_factor)
-        return self.posed[factor]
+            raise ValueError(f"{self.root} has images of one camera in several sizes, which cannot be compared")
+        key = names[0], min(max_factor, side / max(sizes.pop()))
+        if key not in self.posed:
+            self.posed[key] = self._resized(names, side, max_factor)
+        return self.posed[key]
 
     def _resized(self, names: list[str], side: int, max_factor: float) -> PosedFrames:
         common = _common([Lens.of(self.capture.cameras[name]) for name in names])
