@@ -115,6 +115,15 @@ def test_frequencies_of_time_are_those_that_the_frames_determine(num_frames, ban
     assert bands == 1 or 2 * (num_frames - 1) / 2 ** (bands - 1) >= 4.0
 
 
+def test_cameras_at_one_time_do_not_determine_more_frequencies():
+    """Three cameras with small offsets see 20 times each."""
+    moments = {f"{i} {k}": (i, (k + 0.1 * i) / 20) for k in range(20) for i in range(3)}
+    cameras = {name: dataclasses.replace(make_camera(), id=i, time=t) for name, (i, t) in moments.items()}
+    capture = Capture("rig", cameras, [*cameras], [], torch.zeros(0, 3), None, no_frame)
+    config = plain.config(model=ModelConfig(time_bands=10, min_period=4.0))
+    assert make_plan(config, capture)[0].model.time_bands == determined_bands(config.model, 21) == 4
+
+
 def no_frame(name):
     raise AssertionError(name)
 

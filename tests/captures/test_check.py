@@ -19,7 +19,7 @@ from warpgs.captures import opening
 from warpgs.captures.check import check_capture, quick_findings
 from warpgs.captures.depth_check import DEPTH_PROBLEMS
 from warpgs.captures.frames_check import check_counts
-from warpgs.captures.motion_check import motion_between
+from warpgs.captures.motion_check import motion_between, pairs_to_compare
 from warpgs.captures.opening import load_capture
 from warpgs.captures.points_check import check_points
 from warpgs.data.depth_alignment import sample_points
@@ -393,3 +393,11 @@ def test_depth_that_is_no_nearer_to_the_points_than_a_constant_is_not_praised(ro
     monkeypatch.setattr("warpgs.captures.depth_check.sample_points", one_depth)
     said = "0.0% off at the points (median), but a constant is 0.0% off: the points do not tell whether depth is right"
     assert f"aligned depth is {said}" in texts(check_capture(root), "note")
+
+
+def test_only_frames_of_one_camera_are_compared(root):
+    capture = load_capture(root)
+    cameras = {name: replace(c, id=k % 2) for k, (name, c) in enumerate(capture.cameras.items())}
+    pairs = pairs_to_compare(capture.with_cameras(cameras), 100)
+    assert len(pairs) == len(capture.train) - 2
+    assert all(cameras[a].id == cameras[b].id for a, b in pairs)

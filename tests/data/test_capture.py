@@ -61,6 +61,22 @@ def test_neighbours_are_frames_of_one_camera():
     assert capture.neighbours(capture.train) == [("a", "c"), ("c", "e"), ("b", "d")]
 
 
+def test_cameras_with_offsets_do_not_make_time_finer():
+    capture = rig(a=(0, 0.0), b=(1, 0.1), c=(0, 0.4), d=(1, 0.5), e=(0, 0.8), f=(1, 0.9))
+    assert capture.moments == [0.0, 0.4, 0.8, 0.9]
+    assert capture.interval == pytest.approx(0.4)
+
+
+def test_cameras_that_film_one_after_the_other_make_time_longer():
+    capture = rig(a=(0, 0.0), b=(0, 0.25), c=(1, 0.5), d=(1, 0.75), e=(1, 1.0))
+    assert capture.moments == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert capture.split(["c", "e"], []).moments == [0.5, 1.0]
+
+
+def test_frames_of_one_time_have_no_interval():
+    assert rig(a=(0, 0.5), b=(1, 0.5)).interval == 0.0
+
+
 def test_frames_of_an_id_with_two_frames_of_one_time_have_no_neighbours():
     capture = rig(a=(0, 0.0), b=(0, 0.0), c=(0, 0.5), d=(1, 0.0), e=(1, 0.5))
     assert capture.neighbours(capture.train) == [("d", "e")]

@@ -66,3 +66,9 @@ def test_masks_that_are_all_alike_do_not_contradict_each_other(boxes):
 def test_training_says_which_masks_it_does_not_trust():
     found = [f.text for f in quick_findings(capture_of(*[WHOLE, NOTHING] * 4)) if f.topic == "masks"]
     assert any("4 of 8 masks mark nothing, such as that of frame_1" in text for text in found)
+
+
+def test_masks_of_another_camera_say_nothing_about_empty_ones():
+    cameras = [replace(make_camera(), id=k % 2) for k in range(5)]
+    assert untrusted(WHOLE, NOTHING, WHOLE, NOTHING, WHOLE, cameras=cameras) == []
+    assert untrusted(WHOLE, NOTHING, NOTHING, NOTHING, WHOLE, cameras=cameras) == [2]

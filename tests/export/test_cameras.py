@@ -183,6 +183,22 @@ def test_usd_moves_the_camera_over_the_duration(tmp_path):
     assert between == pytest.approx((early + late) / 2)
 
 
+def test_usd_has_a_prim_for_each_camera(tmp_path):
+    Usd = pytest.importorskip("pxr.Usd", reason="usd-core is not installed (extra 'export')")
+    UsdGeom = pytest.importorskip("pxr.UsdGeom")
+    made = capture()
+    ids = {name: k % 2 for k, name in enumerate(made.in_time(made.train))}
+    made = made.with_cameras({name: dataclasses.replace(made.cameras[name], id=i) for name, i in ids.items()})
+    write_cameras(tmp_path, "usd", CameraSet.of(made, TURN, SECONDS))
+    stage = Usd.Stage.Open(str(tmp_path / "cameras.usdc"))
+    assert not stage.GetPrimAtPath("/Cameras/training")
+    for i in (0, 1):
+        prim = UsdGeom.Camera(stage.GetPrimAtPath(f"/Cameras/training_{i}"))
+        times = [made.cameras[name].time for name in made.train if ids[name] == i]
+        last = max([*ids.values()].count(0), [*ids.values()].count(1)) - 1
+        assert prim.GetOrderedXformOps()[0].GetTimeSamples() == pytest.approx([last * time for time in sorted(times)])
+
+
 @pytest.mark.parametrize("name", ["colmap", "nerfstudio"])
 @pytest.mark.parametrize("lens", [(), (RADIAL,), (FISHEYE, "fisheye")])
 def test_cameras_are_read_back_as_they_were(tmp_path, name, lens):

@@ -94,3 +94,18 @@ def test_without_pixels_to_compare_there_is_no_jump(value):
 
 def test_one_frame_has_no_jump():
     assert torch.equal(gains_of([1.0]), torch.ones(1, 3))
+
+
+def test_the_white_balance_of_another_camera_is_no_jump():
+    capture = capture_of([1.0, STOP, 1.0, STOP, 1.0, STOP])
+    cameras = {name: dataclasses.replace(camera, id=int(name) % 2) for name, camera in capture.cameras.items()}
+    gains = exposure_gains(Views(capture.with_cameras(cameras), torch.device("cpu"), 1 << 30))
+    assert torch.equal(gains, torch.ones(6, 3))
+
+
+def test_a_jump_is_found_in_the_frames_of_one_camera():
+    capture = capture_of([1.0, STOP, 1.0, STOP, 1.0, STOP, 1.0, 1.0])
+    cameras = {name: dataclasses.replace(camera, id=int(name) % 2) for name, camera in capture.cameras.items()}
+    gains = exposure_gains(Views(capture.with_cameras(cameras), torch.device("cpu"), 1 << 30))
+    assert torch.equal(gains[:7], torch.ones(7, 3))
+    assert error(gains[7], torch.full((3,), 1.0 / STOP)) < 0.02

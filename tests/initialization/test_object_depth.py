@@ -269,6 +269,15 @@ def test_what_is_hidden_by_half_is_not_followed():
     assert all(len(item.pixels[max(item.pixels)]) >= MIN_VISIBLE * len(item.pixels[0]) for item in objects[:2])
 
 
+def test_an_object_is_followed_through_the_frames_of_one_camera():
+    masks = np.array([ball(1.0, x=0.05 * (k % 2)) for k in range(NUM)])
+    capture = capture_of(masks)
+    cameras = {name: dataclasses.replace(c, id=k % 2) for k, (name, c) in enumerate(capture.cameras.items())}
+    objects = module.find_all_objects(views_of(capture.with_cameras(cameras)))
+    assert [sorted({k % 2 for k in item.pixels}) for item in objects] == [[0], [0], [1], [1]]
+    assert all(len(item.whole) == NUM // 2 for item in objects)
+
+
 def test_objects_that_part_are_told_apart_backward_in_time():
     masks, images = two_balls(np.concatenate([np.full(5, -33.0), np.linspace(-33, -60, NUM - 5)]))
     views = views_of(capture_of(masks, images=images))

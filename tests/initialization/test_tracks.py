@@ -134,6 +134,17 @@ def test_nothing_is_tracked_by_a_camera_that_moves_evenly(turns):
         assert bool(find_tracks(capture)) == (turns > 0)
 
 
+def test_what_two_still_cameras_see_is_tracked_with_as_many_knots_as_either_has_times():
+    capture = ball_on_white([np.array([3.0, 0.0, 1.0]), np.array([0.0, 3.0, 1.0])] * 30)
+    assert find_tracks(capture) == []  # as the places of one camera, that goes back and forth
+    cameras = {name: dataclasses.replace(c, id=int(name) % 2) for name, c in capture.cameras.items()}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "MIN_STEP", 0.0)
+        (track,) = find_tracks(capture.with_cameras(cameras))
+    assert len(track.path.t) == 31 + 2 * module.DEGREE  # 30 times of one camera, and one of the other at the end
+    assert np.linalg.norm(track.path(0.5) - [0.4, 0.0, 0.1 * np.sin(2.0)]) < 0.03
+
+
 def test_the_penalty_is_that_of_fifth_differences():
     points = np.random.default_rng(0).standard_normal((12, 3))
     bands = module._difference_penalty(12)

@@ -182,7 +182,7 @@ def test_a_run_of_few_frames_has_few_frequencies_of_time_and_can_be_resumed(data
     model = dataclasses.replace(tiny.MODEL, time_bands=8, min_period=4.0)
     config = dataclasses.replace(tiny.CONFIG, data=data, out=tmp_path / "run", model=model)
     trainer = script.make_trainer(config)
-    assert "the networks get 2 of 8 frequencies of time: 6 frames determine no more" in trainer.notes
+    assert "the networks get 2 of 8 frequencies of time: 6 times determine no more" in trainer.notes
     assert trainer.config.model.time_bands == trainer.scene.deformation.trunk.bands[1] == 2
     trainer.save()
     assert script.make_trainer(TrainConfig(resume=trainer.run)).config == trainer.config

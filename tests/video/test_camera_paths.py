@@ -277,3 +277,10 @@ def test_a_cropped_view_has_the_rolling_shutter_of_its_rows():
     assert torch.allclose(
         cropped.unproject(rows, columns, depth), whole.unproject(rows + 12, columns, depth), atol=1e-6
     )
+
+
+def test_the_training_path_is_of_the_camera_with_the_most_frames():
+    two = capture([0.0, 9.0, 1.0, 9.0, 2.0], [0.0, 0.1, 0.5, 0.6, 1.0])
+    ids = zip(two.cameras.items(), (0, 1, 0, 1, 0), strict=True)
+    two = two.with_cameras({name: dataclasses.replace(camera, id=i) for (name, camera), i in ids})
+    assert positions(paths.training_path(two, 3, smoothing=0.0))[:, 0].tolist() == pytest.approx([0.0, 1.0, 2.0])

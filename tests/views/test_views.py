@@ -286,12 +286,12 @@ def test_gains_also_divide_images_that_were_read_ahead(capture):
     assert torch.equal(views[1].image, plain / 2.0)
 
 
-def test_views_are_in_the_order_of_time_not_in_that_of_names(capture):
+def test_views_of_a_camera_are_in_the_order_of_time_not_of_names(capture):
     names = capture.train[:3]
     times = zip(names, (0.5, 0.0, 0.2), strict=True)
     moved = {name: dataclasses.replace(capture.cameras[name], time=time) for name, time in times}
     views = Views(capture.assuming("static").split(names, ()).with_cameras(moved), CPU, PLENTY)
-    assert views.in_time == [1, 2, 0]
+    assert views.videos == [[1, 2, 0]]
 
 
 @pytest.mark.parametrize("resident_bytes", [0, PLENTY])

@@ -50,7 +50,8 @@ def import_capture(
         raise ValueError(f"{target} is not an empty folder: choose a new one for the capture")
     capture, renamed = _with_plain_ids(load_capture(source, dataset, factor=factor, cache_frames=2))
     names = capture.in_time((*capture.train, *capture.val))
-    val = list(capture.val) if holdout is None else writer.held_out(names, holdout)
+    by_camera = [name for frames in capture.by_camera(names).values() for name in frames]
+    val = list(capture.val) if holdout is None else writer.held_out(by_camera, holdout)
     with complete_or_absent(target) as folder:
         counts = _write_frames(folder, capture, names, quiet=log is None)
         _write_index(folder, capture, names, val)

@@ -1,6 +1,5 @@
 """Motion between two frames that their cameras do not explain, inside and outside the mask."""
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -40,10 +39,9 @@ MIN_DIFFERENCE = 0.2
 
 
 def pairs_to_compare(capture: Capture, max_count: int) -> list[tuple[str, str]]:
-    """Training frames that follow each other in time and look in similar directions, evenly spread over the capture."""
+    """Training frames that one camera took one after the other in similar directions, evenly spread in time."""
     cameras = capture.cameras
-    names = capture.in_time(capture.train)
-    pairs = [(a, b) for a, b in itertools.pairwise(names) if are_comparable(cameras[a], cameras[b])]
+    pairs = [(a, b) for a, b in capture.neighbours(capture.train) if are_comparable(cameras[a], cameras[b])]
     return evenly_spaced(pairs, max_count)
 
 

@@ -267,15 +267,19 @@ class Capture:
         """The same capture with other cameras of the frames named; the captures have one cache of frames."""
         capture = copy.copy(self)
         capture.cameras, capture._moved = self.cameras | dict(cameras), self._moved | set(cameras)
-        vars(capture).pop("median_depth", None)
+        capture._forget_measures()
         return capture
 
     def split(self, train: Sequence[str], val: Sequence[str]) -> "Capture":
         """The same capture with other frames to train and to evaluate on; the captures have one cache of frames."""
         capture = copy.copy(self)
         capture.train, capture.val = tuple(train), tuple(val)
-        vars(capture).pop("median_depth", None)
+        capture._forget_measures()
         return capture
+
+    def _forget_measures(self) -> None:
+        for name in ("median_depth", "moments"):
+            vars(self).pop(name, None)
 
     def in_time(self, names: Iterable[str]) -> list[str]:
         """Names of frames in the order of their times; those of the same time in the order of the names."""
@@ -287,14 +291,39 @@ class Capture:
         ids = sorted({self.cameras[name].id for name in ordered})
         return {i: [name for name in ordered if self.cameras[name].id == i] for i in ids}
 
-    def neighbours(self, names: Iterable[str]) -> list[tuple[str, str]]:
-        """Pairs of frames of one camera, one after the other in time.
+    def videos(self, names: Iterable[str]) -> list[list[str]]:
+        """Names of frames that one camera took one after the other, in the order of time: a list for each camera.
 
-        An id with several frames of one time has none: it stands for several cameras that are not known.
+        Frames of an id that several of them share with one time are a list each: their cameras are not known.
         """
-        pairs = [[*pairwise(frames)] for frames in self.by_camera(names).values()]
-        times = {name: camera.time for name, camera in self.cameras.items()}
-        return [pair for of_camera in pairs if all(times[a] < times[b] for a, b in of_camera) for pair in of_camera]
+        found: list[list[str]] = []
+        for frames in self.by_camera(names).values():
+            is_one = len({self.cameras[name].time for name in frames}) == len(frames)
+            found += [frames] if is_one else [[name] for name in frames]
+        return found
+
+    def neighbours(self, names: Iterable[str]) -> list[tuple[str, str]]:
+        """Pairs of frames of one camera, one after the other in time."""
+        return [pair for frames in self.videos(names) for pair in pairwise(frames)]
+
+    @cached_property
+    def moments(self) -> list[float]:
+        """The times of the training frames, in order, as one camera takes them.
+
+        They are those of the camera with the most times, and of others before and after it: cameras that film at the
+        same time, with offsets in between, do not determine faster motion.
+        """
+        of_cameras = [{self.cameras[n].time for n in frames} for frames in self.by_camera(self.train).values()]
+        found: list[float] = []
+        for times in sorted(map(sorted, of_cameras), key=lambda times: (-len(times), times)):
+            found = sorted([*found, *(t for t in times if not found or not found[0] <= t <= found[-1])])
+        return found
+
+    @property
+    def interval(self) -> float:
+        """Median time from one of the ``moments`` to the next; 0 if there is one only."""
+        gaps = torch.tensor(self.moments, dtype=torch.float64).diff()
+        return float(gaps.median()) if len(gaps) else 0.0
 
     def frame(self, name: str) -> Frame:
         """A frame, from the cache if it is among the last ``cache_frames`` read.

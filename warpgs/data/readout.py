@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from warpgs.cameras import Camera
@@ -14,9 +14,7 @@ from .capture import Capture
 
 
 def with_readout(capture: Capture, readout: float) -> Capture:
-    """The same capture with cameras in motion, at the speed of a spline through the poses of their frames.
-
-    If two frames have the same time, those of ``train`` are of one camera and those of ``val`` of another.
+    """The same capture with cameras in motion, at the speed of a spline through the poses of each camera's frames.
 
     Args:
         capture: With poses of the middle rows.
@@ -36,25 +34,17 @@ def with_readout(capture: Capture, readout: float) -> Capture:
 
 
 def _in_motion(capture: Capture, readout: float) -> dict[str, Camera]:
-    tracks = [capture.in_time((*capture.train, *capture.val))]
-    if not _gaps(capture, tracks[0]).all():
-        tracks = [capture.in_time(part) for part in (capture.train, capture.val) if part]
-    _check(capture, tracks)
-    duration = readout * float(np.median(_gaps(capture, capture.in_time(capture.train))))
-    return {name: camera for track in tracks for name, camera in _moving(capture, track, duration).items()}
+    videos = [*capture.by_camera((*capture.train, *capture.val)).values()]
+    _check(capture, videos)
+    duration = readout * capture.interval
+    return {name: camera for video in videos for name, camera in _moving(capture, video, duration).items()}
 
 
-def _gaps(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, " G"]:
-    """[G] time from each frame to the next."""
-    return np.diff([capture.cameras[name].time for name in names])
-
-
-def _check(capture: Capture, tracks: Sequence[Sequence[str]]) -> None:
-    for track in tracks:
-        same = (_gaps(capture, track) == 0.0).nonzero()[0]
-        if len(same) or len(track) < 2:
-            first, second = (track[same[0]], track[same[0] + 1]) if len(same) else (track[0], None)
-            what = f"{first} and {second} have one time" if second else f"{first} is the only one"
+def _check(capture: Capture, videos: Sequence[Sequence[str]]) -> None:
+    for names in videos:
+        same = next((pair for pair in pairwise(names) if len({capture.cameras[n].time for n in pair}) == 1), None)
+        if same is not None or len(names) < 2:
+            what = f"{names[0]} is the only one" if same is None else f"{same[0]} and {same[1]} have one time"
             raise ValueError(f"a readout needs frames of one camera one after another: {what}")
 
 

@@ -1,8 +1,8 @@
-"""Cameras as OpenUSD: one prim that moves along the training cameras, one along those of evaluation.
+"""Cameras as OpenUSD: one prim moves along the training frames, one along the evaluation frames, of each camera.
 
 A prim UsdGeomCamera looks along -z with y up. Its ``focalLength`` and apertures are tenths of a scene unit, which
 other programs show as millimetres: only their ratios matter. Apertures are the image at the focal length, their offsets
-the principal point. Time code k is k / (N - 1) of the duration, for N training cameras; programs interpolate between.
+the principal point. Time code k is k / (N - 1) of the duration, for N times of a camera; programs interpolate between.
 """
 
 from pathlib import Path
@@ -23,6 +23,9 @@ FOCAL_LENGTH = 50.0
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 """From x right, y up, z backward to x right, y down, z forward."""
 
+TRAINING = "training"
+"""Prim of the training camera; of several, with the id of each after it."""
+
 NEAR, FAR = 0.01, 1e4
 """Clipping range [scene units]."""
 
@@ -35,18 +38,29 @@ def write_usd_cameras(folder: Path, cameras: CameraSet) -> None:
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Cameras").GetPrim())
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    last = max(1, len(cameras.train) - 1)
+    prims = _by_prim(cameras)
+    last = max(1, max(len(by_time) for prim, by_time in prims.items() if prim.startswith(TRAINING)) - 1)
     stage.SetTimeCodesPerSecond(last / cameras.seconds)
     stage.SetStartTimeCode(0)
     stage.SetEndTimeCode(last)
-    for prim, names in (("training", cameras.train), ("evaluation", [*cameras.cameras.keys() - {*cameras.train}])):
-        by_time = {cameras.cameras[name].time: cameras.cameras[name] for name in sorted(names, reverse=True)}
-        if by_time:
-            camera = UsdGeom.Camera.Define(stage, f"/Cameras/{prim}")
-            camera.CreateClippingRangeAttr(Gf.Vec2f(NEAR, FAR))
-            camera.CreateFocalLengthAttr(FOCAL_LENGTH)
-            _animate(camera, {last * time: by_time[time] for time in sorted(by_time)}, path)
+    for prim, by_time in prims.items():
+        camera = UsdGeom.Camera.Define(stage, f"/Cameras/{prim}")
+        camera.CreateClippingRangeAttr(Gf.Vec2f(NEAR, FAR))
+        camera.CreateFocalLengthAttr(FOCAL_LENGTH)
+        _animate(camera, {last * time: by_time[time] for time in sorted(by_time)}, path)
     save_stage(stage, path)
+
+
+def _by_prim(cameras: CameraSet) -> dict[str, dict[float, Camera]]:
+    """The cameras of each prim by their times: training and evaluation, with the id if several cameras do it."""
+    found: dict[str, dict[float, Camera]] = {}
+    for prim, names in ((TRAINING, cameras.train), ("evaluation", cameras.cameras.keys() - {*cameras.train})):
+        ids = sorted({cameras.cameras[name].id for name in names})
+        for i in ids:
+            of_id = (name for name in sorted(names, reverse=True) if cameras.cameras[name].id == i)
+            by_time = {cameras.cameras[name].time: cameras.cameras[name] for name in of_id}
+            found[prim if len(ids) == 1 else f"{prim}_{i}"] = by_time
+    return found
 
 
 def _animate(prim: Any, cameras: dict[float, Camera], path: Path) -> None:

@@ -27,19 +27,21 @@ def exposure_gains(views: Views) -> Float[Tensor, "T 3"]:
     """How much brighter each training frame is than most, per channel; exactly 1 without jumps.
 
     Intensities are multiplied by about a constant when a camera's exposure or white balance jumps. In the order of
-    time, each frame is compared with the one before: the median of the ratio of their static pixels. Ratios close to 1
-    are taken as 1, so that gradual changes stay.
+    time, each frame is compared with the one before of its camera: the median of the ratio of their static pixels.
+    Ratios close to 1 are taken as 1, so that gradual changes stay.
 
     Returns:
-        [T, 3] factors of red, green and blue, in the order of the views; their median over frames is 1.
+        [T, 3] factors of red, green and blue, in the order of the views; their median over frames of a camera is 1.
     """
-    logs, log, before = torch.zeros(len(views), 3, dtype=torch.float32), torch.zeros(3, dtype=torch.float32), None
-    for k, frame in zip(views.in_time, views.frames(views.in_time), strict=True):
-        after = _log_intensities(frame)
-        if before is not None:
-            log = log + _jump(before, after)
-        logs[k], before = log, after
-    logs -= logs.median(0).values
+    logs = torch.zeros(len(views), 3, dtype=torch.float32)
+    for video in views.videos:
+        log, before = torch.zeros(3, dtype=torch.float32), None
+        for k, frame in zip(video, views.frames(video), strict=True):
+            after = _log_intensities(frame)
+            if before is not None:
+                log = log + _jump(before, after)
+            logs[k], before = log, after
+        logs[video] -= logs[video].median(0).values
     logs[logs.abs().amax(1) < MIN_JUMP] = 0.0  # what rounding leaves of a jump and of the one back
     return logs.exp()
 

@@ -55,7 +55,7 @@ def find_objects(views: Views, order: Sequence[int]) -> list[MovingObject]:
 
     Args:
         views: The training views.
-        order: Their indices, by time or backward in time.
+        order: Indices of those of one camera, by time or backward in time.
     """
     follower = _Follower()
     for index, frame in zip(order, views.frames(order), strict=True):
@@ -72,8 +72,8 @@ def num_cut_off(objects: Sequence[MovingObject]) -> int | None:
 
 def find_all_objects(views: Views) -> list[MovingObject]:
     """The objects that the masks show by time, then those backward in time: what parts later is told apart before."""
-    order = views.in_time
-    return [item for indices in (order, order[::-1]) for item in find_objects(views, indices)]
+    orders = (order for video in views.videos for order in (video, video[::-1]))
+    return [item for order in orders for item in find_objects(views, order)]
 
 
 class _Follower:

@@ -26,10 +26,10 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
     """
     config, notes = scaled(config), []
     background, loss = _background(config, capture), config.loss
-    asked, num = config.model.time_bands, len(capture.train)
+    asked, num = config.model.time_bands, len(capture.moments)
     bands = determined_bands(config.model, num)
     if bands < asked:
-        notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} frames determine no more")
+        notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} times determine no more")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
     poses = config.optim.poses * min(1.0, num / MANY_FRAMES)
     if poses < config.optim.poses:
@@ -64,7 +64,7 @@ def mean_color(capture: Capture) -> Color:
     return red, green, blue
 
 
-def determined_bands(model: ModelConfig, num_frames: int) -> int:
+def determined_bands(model: ModelConfig, num_times: int) -> int:
     """Number of frequencies of time for a capture, at most ``model.time_bands`` and at least 1 of them.
 
     See ``ModelConfig.min_period``.
@@ -73,5 +73,5 @@ def determined_bands(model: ModelConfig, num_frames: int) -> int:
     """
     if model.min_period == 0 or model.time_bands == 0:
         return model.time_bands
-    periods = 2.0 * (num_frames - 1) / model.min_period
+    periods = 2.0 * (num_times - 1) / model.min_period
     return min(model.time_bands, 1 + math.floor(math.log2(max(1.0, periods))))

@@ -91,21 +91,25 @@ def find_tracks(capture: Capture, views: Views) -> list[Track]:
     regions, labels = _divided(regions, labels, count)
     tracks = []
     for label in range(count):
-        track = _track([regions[k] for k in np.flatnonzero(labels == label)], len(by_frame))
+        track = _track([regions[k] for k in np.flatnonzero(labels == label)], len(capture.moments))
         if track is None:
             return []
         tracks.append(track)
-    times = np.unique([capture.cameras[name].time for name in capture.train])
-    steps = [np.linalg.norm(np.diff(t.path(times), axis=0), axis=1) / (2.0 * t.radius) for t in tracks]
+    steps = [np.linalg.norm(np.diff(t.path(capture.moments), axis=0), axis=1) / (2.0 * t.radius) for t in tracks]
     return tracks if np.median(steps) >= MIN_STEP else []
 
 
 def _jumps(capture: Capture) -> bool:
-    """Whether the camera is at another place in every frame, instead of moving evenly or not at all."""
+    """Whether there are several cameras, or one that is elsewhere in every frame instead of moving evenly or not.
+
+    The rays of two cameras at one time meet at the object, however either moves.
+    """
+    if len(capture.moments) < MIN_REGIONS:
+        return False
+    if len(capture.by_camera(capture.train)) > 1:
+        return True
     cameras = sorted((capture.cameras[name] for name in capture.train), key=lambda camera: camera.time)
     centers = np.stack([camera.position.numpy() for camera in cameras])
-    if len(np.unique([camera.time for camera in cameras])) < MIN_REGIONS:
-        return False
     step, bend = (np.median(np.linalg.norm(np.diff(centers, order, axis=0), axis=1)) for order in (1, 2))
     return bool(bend > MIN_BEND * step)
 
@@ -144,11 +148,11 @@ def _divided(regions: list[Region], labels: np.ndarray, count: int) -> tuple[lis
     return parts, np.array(found)
 
 
-def _track(regions: list[Region], num_frames: int) -> Track | None:
+def _track(regions: list[Region], num_times: int) -> Track | None:
     """The smooth path that most rays of some regions meet; None if they are too few or meet none."""
     if len(regions) < MIN_REGIONS:
         return None
-    fit = _Fit(regions, num_frames)
+    fit = _Fit(regions, num_times)
     error, smoothness = min((fit.error(smoothness), smoothness) for smoothness in SMOOTHNESS)
     path, misses = fit.path(smoothness)
     radius = fit.radius(path)
@@ -161,8 +165,8 @@ def _track(regions: list[Region], num_frames: int) -> Track | None:
 class _Fit:
     """Weighted least squares for the coefficients of a path: a banded system, as each ray concerns four of them."""
 
-    def __init__(self, regions: list[Region], num_frames: int) -> None:
-        self.knots = np.arange(-DEGREE, num_frames + DEGREE) / (num_frames - 1)
+    def __init__(self, regions: list[Region], num_times: int) -> None:
+        self.knots = np.arange(-DEGREE, num_times + DEGREE) / (num_times - 1)
         self.times = np.array([region.time for region in regions]).clip(0.0, 1.0)
         self.origins, self.rays = (np.array([getattr(r, name) for r in regions]) for name in ("origin", "center"))
         self.angles = np.array([region.radius for region in regions])

@@ -155,7 +155,7 @@ def evenly_spaced(frames: int) -> list[float]:
 def training_path(capture: Capture, frames: int, smoothing: float = SMOOTHING) -> list[Camera]:
     """The training cameras in the order of their times, smoothed, with time running over [0, 1].
 
-    If several cameras have the same time, the first one is used.
+    Of several cameras, it is that of the one with the most frames; if two frames have one time, the first one counts.
     """
     recorded, times = _in_time(capture), evenly_spaced(frames)
     size = recorded[0].size
@@ -189,9 +189,10 @@ def jumps(capture: Capture) -> bool:
 
 
 def _in_time(capture: Capture) -> list[Camera]:
-    """The training cameras in the order of their times, one for each time, as pinholes."""
+    """The training frames of one camera in the order of their times, one for each time, as pinholes."""
     by_time: dict[float, Camera] = {}
-    for name in capture.train:
+    of_camera = max(capture.by_camera(capture.train).values(), key=len)
+    for name in (name for name in capture.train if name in {*of_camera}):
         by_time.setdefault(capture.cameras[name].time, capture.cameras[name].pinhole)
     return [by_time[time] for time in sorted(by_time)]
 

@@ -155,9 +155,10 @@ class Views:
             yield graphs.run("view", lambda: work(self.selected())) if graphs else work(self.selected())
 
     @property
-    def in_time(self) -> list[int]:
-        """The indices of all views in the order of time."""
-        return sorted(range(len(self)), key=lambda index: self._camera(index).time)
+    def videos(self) -> list[list[int]]:
+        """The indices of the views of each camera, in the order of time; see ``Capture.videos``."""
+        index = {name: k for k, name in enumerate(self._capture.train)}
+        return [[index[name] for name in names] for names in self._capture.videos(self._capture.train)]
 
     def frames(self, indices: Sequence[int]) -> Iterator[Frame]:
         """The frames of these indices, on the CPU, with jumps of exposure and without depth; not to be changed."""
@@ -228,10 +229,8 @@ class Views:
 
     @cached_property
     def interval(self) -> float:
-        """Median time between successive training views; 0 if all have the same time."""
-        times = torch.tensor([self._capture.cameras[name].time for name in self._capture.train], dtype=torch.float64)
-        gaps = times.unique().diff()
-        return float(gaps.median()) if len(gaps) else 0.0
+        """See ``Capture.interval``."""
+        return self._capture.interval
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
