@@ -207,7 +207,10 @@ class Camera:
 
     @property
     def pinhole(self) -> "Camera":
-        """The camera without the distortion of its lens and with a global shutter."""
+        """The camera without the distortion of its lens and with a global shutter; of a panorama 90 degrees across."""
+        if self.distortion is not None and self.distortion.lens == "equirectangular":
+            K = intrinsic_matrix((self.width / 2, self.width / 2), (self.width / 2, self.height / 2))
+            return dataclasses.replace(self, K=torch.tensor(K).to(self.K), distortion=None, motion=None)
         return dataclasses.replace(self, distortion=None, motion=None)
 
     @staticmethod

@@ -151,13 +151,11 @@ def test_names_in_another_encoding_are_refused_by_number(text):
     refused(root, r"the name of image 4 is not in UTF-8: b'K\\xfcche\.png'")
 
 
-def test_panoramas_of_colmap_are_told_how_to_be_cut(edited):
+def test_equirectangular_images_of_colmap_are_read(edited):
     root = edited("colmap")
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=40, height=24, params=[40.0, 24.0])
     model = pycolmap.Reconstruction(str(root / "sparse/0"))
     camera.camera_id = 3
     model.cameras[3].model, model.cameras[3].params = camera.model, camera.params
     model.write_binary(str(root / "sparse/0"))
-    refused(
-        root, "camera 3: the camera model EQUIRECTANGULAR is not supported: it is one of 360° images, .*perspective"
-    )
+    assert load_capture(root).cameras["frame_00003"].distortion.lens == "equirectangular"

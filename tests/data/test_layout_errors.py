@@ -71,7 +71,7 @@ DAMAGES = [
     ("colmap", lambda r: write_png(r / "masks/frame_00002.png.png", SMALL[..., 0]), "the mask is 9×9"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[]), "frames must be a list of at least one"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", frames=[3]), "frames must be a list"),
-    ("nerfstudio", lambda r: edit_json(r / "transforms.json", camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR is"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", camera_model="VR180_L"), "VR180_L is"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", w="wide"), "w must hold numbers"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", w=-3), "expected 1 to"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", k4=0.1), "k4 must be 0"),

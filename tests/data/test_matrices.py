@@ -1,6 +1,7 @@
 """Intrinsics as matrices and rotations with one scale are read; others are refused with what was found."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -97,18 +98,36 @@ def test_without_a_focal_length_the_message_lists_what_there_is(edited):
     refused(root, "no fl_x or camera_angle_x, nor a matrix K; a frame has depth_file_path, file_path, fx, mask_path")
 
 
-@pytest.mark.parametrize("flag", ["equirectangular", "latlong"])
-def test_panoramas_of_instant_ngp_are_told_how_to_be_cut(edited, flag):
+def test_panoramas_of_equal_area_are_told_what_to_convert_to(edited):
     root = edited("nerfstudio")
-    edit_json(root / "transforms.json", **{flag: True})
-    refused(root, "is not supported: it is one of 360° images, which must be cut into perspective views")
+    edit_json(root / "transforms.json", equirectangular=True)
+    refused(root, "EQUIRECTANGULAR of equal area is not supported: it is one of 360° images, which must be equirectang")
 
 
-@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "VR180_L", "OMNIDIRECTIONALSTEREO_L", "SPHERICAL"])
+@pytest.mark.parametrize("flag", [{"latlong": True}, {"camera_model": "EQUIRECTANGULAR"}])
+def test_equirectangular_images_need_no_focal_length(edited, flag):
+    root = edited("nerfstudio")
+    every_frame(root, lambda entry, k: without_fields(entry))
+    edit_json(root / "transforms.json", **flag)
+    camera = load_capture(root).cameras["frame_00003"]
+    assert camera.distortion.lens == "equirectangular"
+    assert camera.K.diagonal()[:2].tolist() == pytest.approx([40 / (2 * math.pi), 24 / math.pi])
+    assert camera.K[:2, 2].tolist() == [20.0, 12.0]
+
+
+def test_focal_lengths_of_a_panorama_are_pixels_per_180_degrees(edited):
+    root = edited("nerfstudio")
+    every_frame(root, lambda entry, k: (without_fields(entry), entry.update(fl_x=30.0, fl_y=26.0)))
+    edit_json(root / "transforms.json", camera_model="EQUIRECTANGULAR")
+    camera = load_capture(root).cameras["frame_00003"]
+    assert camera.K.diagonal()[:2].tolist() == pytest.approx([30 / math.pi, 26 / math.pi])
+
+
+@pytest.mark.parametrize("model", ["VR180_L", "OMNIDIRECTIONALSTEREO_L", "SPHERICAL"])
 def test_panoramas_are_not_told_to_be_undistorted(edited, model):
     root = edited("nerfstudio")
     edit_json(root / "transforms.json", camera_model=model)
-    refused(root, f"^(?!.*undistort).*camera model {model} is not supported.*cut into perspective views")
+    refused(root, f"^(?!.*undistort).*camera model {model} is not supported.*perspective views")
 
 
 def test_orthographic_cameras_are_refused(edited):

@@ -176,7 +176,7 @@ def _epipolar_distance(first: Camera, second: Camera, flow: Float[np.ndarray, "H
     shift = first.viewmat[:3, :3].double() @ (first.position - second.position).double()
     if float(shift.norm()) < 1e-6:  # pure rotation: every pixel stays where it is
         return np.linalg.norm(flow, axis=-1)
-    e = (first.resized(width, height).K.double() @ shift).numpy()
+    e = (first.pinhole.resized(width, height).K.double() @ shift).numpy()
     along = np.stack([e[0] - e[2] * x, e[1] - e[2] * y])
     along /= np.maximum(np.hypot(*along), 1e-12)
     return np.abs(along[0] * flow[..., 1] - along[1] * flow[..., 0])

@@ -66,7 +66,7 @@ def turning_of(frames: Sequence[Frame]) -> tuple[Turning, Turning] | None:
     features = [_features(frame, size) for frame in frames]
     pairs = [p for p in itertools.combinations(range(len(frames)), 2) if p[1] - p[0] <= MAX_STEP]
     matches = [found for a, b in pairs if (found := _match(features[a], features[b])) is not None]
-    focal = float(np.median([float(frame.camera.resized(*size).K[0, 0]) for frame in frames]))
+    focal = float(np.median([float(frame.camera.pinhole.resized(*size).K[0, 0]) for frame in frames]))
     searched, known = find_turning(matches, size), find_turning(matches, size, focal)
     return None if searched is None or known is None else (searched, known)
 

@@ -42,11 +42,11 @@ def read_camera(
     """
     fields = read_json(path, "every frame needs its camera")
     lens = _lens(path, fields, factor)
-    lens = lens if distortion else lens.centered_pinhole
     rotation, position = read_numbers(path, fields, "orientation", (3, 3)), read_numbers(path, fields, "position", (3,))
     if not is_rotation(rotation):
         raise ValueError(f"{path}: orientation is not a rotation")
     try:
+        lens = lens if distortion else lens.centered_pinhole
         return lens.checked().camera(rotation, units.from_world(position), time), lens
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -66,6 +66,10 @@ def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
     fisheye = _coefficients(path, fields, "fisheye_distortion", 4) if "fisheye_distortion" in fields else None
     if fisheye is not None and any(radial):
         raise ValueError(f"{path}: a fisheye_distortion cannot have others beside it")
+    if (is_panorama := fields.get("equirectangular", False)) not in (True, False):
+        raise ValueError(f"{path}: equirectangular must be true or false, got {reprlib.repr(is_panorama)}")
+    if is_panorama and (fisheye is not None or any(radial)):
+        raise ValueError(f"{path}: an equirectangular image has no distortion")
     full = read_numbers(path, fields, "image_size", (2,))
     # Rounded as in Nerfies, whose code created the images.
     width, height = (round(float(side) / factor) for side in full)
@@ -75,7 +79,7 @@ def _lens(path: Path, fields: dict[str, Any], factor: int) -> Lens:
         focal=(focal / factor, focal * aspect / factor),
         center=(float(x), float(y)),
         coefficients=radial if fisheye is None else tuple(fisheye),
-        model="radial" if fisheye is None else "fisheye",
+        model="equirectangular" if is_panorama else "radial" if fisheye is None else "fisheye",
     )
 
 

@@ -28,6 +28,9 @@ NUM_PARAMETERS = {
 """Camera models that can be represented, and the number of their parameters: focal lengths, principal point, and
 OpenCV's coefficients as far as the model has them."""
 
+PANORAMA = "EQUIRECTANGULAR"
+"""The camera model of panoramas, whose parameters are width and height."""
+
 
 class ModelImage(NamedTuple):
     """An image of a model: its file name, lens, and [3, 4] world-to-camera pose."""
@@ -85,6 +88,8 @@ def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float
     Raises:
         ValueError: If the camera model cannot be represented, or a number is missing or out of range.
     """
+    if model == PANORAMA:
+        return Lens.panorama(size)
     if model not in NUM_PARAMETERS:
         raise ValueError(unsupported_model(model, "first run colmap image_undistorter, whose output is read"))
     if len(params) != NUM_PARAMETERS[model]:
@@ -96,6 +101,8 @@ def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float
 
 def parameters_of_lens(lens: Lens) -> tuple[str, list[float]]:
     """The camera model that represents a lens, and its parameters."""
+    if lens.model == "equirectangular":
+        return PANORAMA, [float(lens.width), float(lens.height)]
     name = "OPENCV_FISHEYE" if lens.model == "fisheye" else "OPENCV" if len(lens.coefficients) <= 4 else "FULL_OPENCV"
     parameters = [*lens.focal, *lens.center, *lens.coefficients, *[0.0] * 8]
     return name, parameters[: NUM_PARAMETERS[name]]

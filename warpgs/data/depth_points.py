@@ -60,18 +60,17 @@ def points_of_views(views: Sequence[DepthView]) -> tuple[Float[np.ndarray, "P 3"
 
 
 def _unproject(view: DepthView, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    x, y = view.lens.unproject(column + 0.5, row + 0.5)
-    in_camera = np.stack([x, y, np.ones(len(row))], 1) / view.inverse_depth[row, column][:, None]
+    rays = view.lens.rays(column + 0.5, row + 0.5)
+    in_camera = rays / (view.lens.file_depths(rays) * view.inverse_depth[row, column])[:, None]
     return (in_camera - view.pose[:, 3]) @ view.pose[:, :3]
 
 
 def _agrees(view: DepthView, points: np.ndarray) -> np.ndarray:
     """Whether the points lie on the surface that a view sees there."""
     in_camera = points @ view.pose[:, :3].T + view.pose[:, 3]
-    depth = in_camera[:, 2]
+    depth = view.lens.file_depths(in_camera)
     front = depth > 1e-9
-    x, y = in_camera[:, :2].T / np.where(front, depth, 1.0)
-    pixels = view.lens.image(x, y).T
+    pixels = view.lens.project(np.where(front[:, None], in_camera, (0.0, 0.0, 1.0)))
     height, width = view.inverse_depth.shape
     inside = front & (pixels >= 0).all(1) & (pixels < (width, height)).all(1)
     column, row = np.where(inside[:, None], pixels, 0.0).astype(int).T

@@ -18,13 +18,16 @@ from warpgs.files import MAX_NUMBER
 
 from .images import MAX_PIXELS, MAX_SIDE
 
-DistortionModel = Literal["radial", "fisheye"]
+DistortionModel = Literal["radial", "fisheye", "equirectangular"]
 
 MIN_FOCAL = 1e-3
 """Minimum focal length [px]; the reciprocals of smaller ones overflow."""
 
 MAX_SLOPE = math.tan(math.radians(85.0))
 """Maximum distance from the axis on the plane z = 1 of what a fisheye lens sees there; the plane ends at 90°."""
+
+MAX_REACH = 1.001
+"""How much farther than half of all directions a panorama may reach: sizes are rounded."""
 
 PANORAMAS = ("EQUIRECT", "SPHER", "PANORAMA", "LATLONG", "OMNI", "VR180", "360")
 """Parts of the names that programs give to camera models of panoramas."""
@@ -34,9 +37,8 @@ def unsupported_model(model: object, remedy: str) -> str:
     """Message that a camera model is not read, and what to do: ``remedy``, unless it is one of panoramas."""
     if any(part in str(model).upper() for part in PANORAMAS):
         return (
-            f"the camera model {model} is not supported: it is one of 360° images, which must be cut into perspective "
-            "views before their poses are estimated, as by ns-process-data images --camera-type equirectangular of "
-            "nerfstudio or panorama_sfm.py of COLMAP"
+            f"the camera model {model} is not supported: it is one of 360° images, which must be equirectangular "
+            "(EQUIRECTANGULAR); convert them, or cut them into perspective views before their poses are estimated"
         )
     return f"the camera model {model} is not supported; {remedy}"
 
@@ -50,7 +52,7 @@ class Lens:
         focal: (x, y) focal lengths [px].
         center: (x, y) principal point from the corner of the image [px].
         coefficients: Of its distortion, in OpenCV's order, as ``Distortion`` has them; zeros at their end are omitted.
-        model: What they are of.
+        model: What they are of; the focal lengths of an equirectangular image are pixels per radian.
     """
 
     width: int
@@ -71,13 +73,19 @@ class Lens:
         plain, distortion = Lens(*camera.size, (fx, fy), (cx, cy)), camera.distortion
         if distortion is None:
             return plain
-        assert distortion.lens != "equirectangular"  # which no loader makes
         return replace(plain, coefficients=tuple(distortion.coefficients.tolist()), model=distortion.lens)
 
     @staticmethod
     def centered(focal: float, size: tuple[int, int]) -> "Lens":
         """A pinhole lens with square pixels and its axis in the middle of images of (width, height) [px]."""
         return Lens(*size, (focal, focal), (size[0] / 2.0, size[1] / 2.0))
+
+    @staticmethod
+    def panorama(size: tuple[int, int]) -> "Lens":
+        """The lens of equirectangular images of all directions, of (width, height) [px]."""
+        width, height = size
+        focal, center = (width / math.tau, height / math.pi), (width / 2, height / 2)
+        return Lens(width, height, focal, center, model="equirectangular")
 
     def checked(self) -> "Lens":
         """This lens, if its numbers can be used; ``distortion`` also refuses lenses that fold back.
@@ -106,7 +114,9 @@ class Lens:
 
     @property
     def centered_pinhole(self) -> "Lens":
-        """A pinhole lens of these focal lengths, with its axis in the middle of the image."""
+        """A pinhole lens of these focal lengths, with its axis in the middle; raises ValueError of a panorama."""
+        if self.model == "equirectangular":
+            raise ValueError("a panorama has no pinhole: omit --no-distortion, which is part of the preset paper")
         return Lens(self.width, self.height, self.focal, (self.width / 2, self.height / 2))
 
     @property
@@ -121,7 +131,11 @@ class Lens:
 
     @property
     def distortion(self) -> Distortion | None:
-        """The distortion, None of a pinhole; raises ValueError if the lens folds back inside the image."""
+        """The distortion, None of a pinhole.
+
+        Raises:
+            ValueError: If the lens folds back inside the image, or a panorama has more than all directions.
+        """
         return _distortion(self)
 
     def camera(self, rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"], time: float = 0.0) -> Camera:
@@ -131,11 +145,19 @@ class Lens:
 
     def image(self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]) -> Float[np.ndarray, "2 ..."]:
         """Projects points on the plane z = 1 to u, v [px from the corner]."""
-        bent = np.stack([x, y])
-        if (distortion := self.distortion) is not None:
-            viewed = torch.from_numpy(np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3))
-            bent = distortion.bend(viewed).numpy().T.reshape(bent.shape)
-        return np.stack([self.focal[k] * bent[k] + self.center[k] for k in (0, 1)])
+        return self.project(np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)).T.reshape(2, *np.shape(x))
+
+    def project(self, viewed: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 2"]:
+        """[P, 2] where points in the camera are in the image [px from the corner], of a pinhole if in front of it."""
+        if (distortion := self.distortion) is None:
+            bent = viewed[:, :2] / viewed[:, 2:]
+        else:
+            bent = distortion.bend(torch.from_numpy(viewed)).numpy()
+        return bent * self.focal + self.center
+
+    def file_depths(self, viewed: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+        """[P] depth of points in the camera as depth files have it: z, but of a panorama the distance."""
+        return np.linalg.norm(viewed, axis=1) if self.model == "equirectangular" else viewed[:, 2]
 
     def rays(self, u: Float[np.ndarray, "*N"], v: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N 3"]:
         """[..., 3] points in the camera at depth 1, as of ``Camera.depths``, that it sees at u, v; NaN at none."""
@@ -164,7 +186,10 @@ class Lens:
         return u, v
 
     def axial_depths(self) -> Float[np.ndarray, "H W"]:
-        """[H, W] z of what each pixel shows at depth 1: 1, or of a fisheye less, and NaN from 90° on."""
+        """[H, W] z of what each pixel shows at depth 1: of a fisheye less than 1, and NaN from 90° on.
+
+        It is 1 of a panorama, too: files have the distance from it.
+        """
         return _axial_depths(self)
 
     def unit_rays(self, positions: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 3"]:
@@ -177,13 +202,25 @@ class Lens:
 def _distortion(lens: Lens) -> Distortion | None:
     if lens.is_pinhole:
         return None
+    if lens.model == "equirectangular":
+        return _panorama(lens)
     make = Distortion.fisheye if lens.model == "fisheye" else Distortion.radial
     return make(lens.coefficients, torch.tensor(lens.matrix, dtype=torch.float32), (lens.width, lens.height))
 
 
+def _panorama(lens: Lens) -> Distortion:
+    center, size = np.array(lens.center), np.array([lens.width, lens.height])
+    aside, up = np.degrees(np.maximum(center, size - center) / lens.focal)
+    if not (aside < MAX_REACH * 180.0 and up < MAX_REACH * 90.0):
+        raise ValueError(
+            f"a panorama reaches at most 180° to the sides and 90° up and down, this one {aside:.4g}° and {up:.4g}°"
+        )
+    return Distortion.equirectangular()
+
+
 @lru_cache(maxsize=4)
 def _axial_depths(lens: Lens) -> Float[np.ndarray, "H W"]:
-    if lens.model == "radial":
+    if lens.model != "fisheye":
         return np.ones((lens.height, lens.width), np.float32)
     z = lens.rays(*lens.pixel_centers())[..., 2].astype(np.float32)
     return np.where(z > 0.0, z, np.float32(np.nan))

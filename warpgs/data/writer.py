@@ -109,11 +109,16 @@ def write_camera(
         position: [3] camera centre in the world.
     """
     k = [*lens.coefficients, *[0.0] * 12][:12]
-    radial = {
+    radial: dict[str, object] = {
         "radial_distortion": [k[0], k[1], k[4]],
         "tangential_distortion": k[2:4],
         **({"rational_distortion": k[5:8]} if any(k[5:8]) else {}),
         **({"prism_distortion": k[8:]} if any(k[8:]) else {}),
+    }
+    distortions: dict[str, dict[str, object]] = {
+        "radial": radial,
+        "fisheye": {"fisheye_distortion": k[:4]},
+        "equirectangular": {"equirectangular": True},
     }
     fields = {
         "orientation": rotation.tolist(),
@@ -122,7 +127,7 @@ def write_camera(
         "principal_point": lens.center,
         "skew": 0.0,
         "pixel_aspect_ratio": lens.focal[1] / lens.focal[0],
-        **(radial if lens.model == "radial" else {"fisheye_distortion": k[:4]}),
+        **distortions[lens.model],
         "image_size": [lens.width, lens.height],
     }
     write_json(root / f"camera/{name}.json", fields)

@@ -44,6 +44,12 @@ class CameraSet(NamedTuple):
         """Whether any lens is no pinhole."""
         return any(camera.distortion is not None for camera in self.cameras.values())
 
+    @property
+    def has_panoramas(self) -> bool:
+        """Whether any lens is equirectangular."""
+        lenses = [camera.distortion for camera in self.cameras.values()]
+        return any(lens is not None and lens.lens == "equirectangular" for lens in lenses)
+
 
 def held_lens(name: str, camera: Camera, count: int) -> Lens:
     """The lens of a camera; raises ValueError if it has more than ``count`` coefficients of a radial lens."""

@@ -32,6 +32,8 @@ def write_cameras(folder: Path, name: str, cameras: CameraSet) -> str:
         OSError: If a file cannot be written, or a package that writes it is not installed.
     """
     form = CAMERA_FORMATS[name]
+    if cameras.has_panoramas and not form.has_lens:
+        raise ValueError(f"--cameras {name} holds pinholes, not panoramas: use --cameras nerfstudio or colmap")
     form.write(folder, cameras)
     lines = [f"{len(cameras.cameras):,} cameras in {folder}, in the coordinates of the scene's file: {form.axes}"]
     if cameras.is_distorted and not form.has_lens:

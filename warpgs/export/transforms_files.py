@@ -4,6 +4,7 @@ Poses are camera-to-world with OpenGL axes (x right, y up, z backward), in scene
 corner of the image.
 """
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -16,27 +17,38 @@ from warpgs.formats.ply import write_ply
 
 from .camera_set import CameraSet, held_lens
 
+MODELS = {"radial": "OPENCV", "fisheye": "OPENCV_FISHEYE", "equirectangular": "EQUIRECTANGULAR"}
+"""nerfstudio's ``camera_model`` of a lens."""
+
 
 def write_nerfstudio(folder: Path, cameras: CameraSet) -> None:
     """transforms.json, and points.ply if there are points."""
     frames, fields = [], _transforms(cameras)
     models = {held_lens(name, camera, 5).model for name, camera in cameras.cameras.items()}
     if len(models) > 1:
-        raise ValueError("transforms.json holds one kind of lens: some cameras are fisheyes, others are not")
+        raise ValueError(
+            f"transforms.json holds one kind of lens, these cameras have {len(models)}: {', '.join(models)}"
+        )
     for name, camera in cameras.cameras.items():
         lens = Lens.of(camera)
+        unit = math.pi if lens.model == "equirectangular" else 1.0  # nerfstudio's are pixels per 180 degrees
         names = ("k1", "k2", "k3", "k4") if lens.model == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
         frames.append(
             {
                 **_frame(f"images/{name}.png", camera),
-                **{"fl_x": lens.focal[0], "fl_y": lens.focal[1], "cx": lens.center[0], "cy": lens.center[1]},
+                **{
+                    "fl_x": unit * lens.focal[0],
+                    "fl_y": unit * lens.focal[1],
+                    "cx": lens.center[0],
+                    "cy": lens.center[1],
+                },
                 **{"w": lens.width, "h": lens.height, **dict(zip(names, lens.coefficients, strict=False))},
             }
         )
     train = set(cameras.train)
     files = {is_train: [f"images/{n}.png" for n in cameras.cameras if (n in train) == is_train] for is_train in (1, 0)}
     splits = {"train_filenames": files[1], "val_filenames": files[0], "test_filenames": files[0]}
-    model = "OPENCV_FISHEYE" if models == {"fisheye"} else "OPENCV"
+    model = MODELS[models.pop()]
     points = {"ply_file_path": "points.ply"} if len(cameras.points) else {}
     write_json(folder / "transforms.json", {"camera_model": model, **fields, **points, **splits, "frames": frames})
     if len(cameras.points):

@@ -176,8 +176,8 @@ def _cameras(
     cameras, lenses = {}, {}
     for frame in frames:
         lens = reduced(frame.lens, options.factor or 1)
-        lenses[frame.name] = lens if options.distortion else lens.centered_pinhole
         try:
+            lenses[frame.name] = lens if options.distortion else lens.centered_pinhole
             cameras[frame.name] = _camera(frame, lenses[frame.name], units, (frame.time - start) / length)
         except ValueError as error:
             raise ValueError(f"{root}: frame {frame.name}: {error}") from error

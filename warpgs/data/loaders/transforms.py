@@ -3,13 +3,13 @@
 ``transform_matrix`` is camera-to-world with OpenGL axes (x right, y up, z backward). Intrinsics are pixels from the
 corner of the image: ``fl_x``, ``fl_y``, ``cx``, ``cy``, ``w``, ``h``, or a matrix ``K``, or ``camera_angle_x`` (the
 horizontal field of view) with the principal point in the middle. Distortion is OpenCV's: ``k1``, ``k2``, ``p1``,
-``p2``, ``k3``, or of a fisheye lens ``k1`` to ``k4``. Each may be given once or per frame.
+``p2``, ``k3``, or of a fisheye lens ``k1`` to ``k4``. Focal lengths of equirectangular images are nerfstudio's, pixels
+per 180 degrees: half the width and the height where they have all directions. Each may be given once or per frame.
 """
 
 import math
 import reprlib
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +36,14 @@ from .posed import opencv_from_opengl, world_to_camera
 from .turned import unclear_note
 
 PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-"""Values of ``camera_model`` of a perspective lens; the other one that is read is ``FISHEYE``."""
+"""Values of ``camera_model`` of a perspective lens; the others that are read are ``FISHEYE`` and ``PANORAMA``."""
 
-FISHEYE = "OPENCV_FISHEYE"
+FISHEYE, PANORAMA = "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 
 INSTANT_NGP = {
     "is_fisheye": FISHEYE,
-    "equirectangular": "EQUIRECTANGULAR",
-    "latlong": "LATLONG",
+    "equirectangular": "EQUIRECTANGULAR of equal area",  # rows are sines of latitudes
+    "latlong": PANORAMA,
     "ftheta_p0": "FTHETA",
     "orthographic": "ORTHOGRAPHIC",
 }
@@ -92,8 +92,8 @@ class Transforms:
         self._scale = scale_of_rotations(self._matrix(frame) for frame in frames)
         for frame in frames:
             model = self._model(frame)
-            if model not in (*PERSPECTIVE, FISHEYE):
-                expected = f"expected one of {', '.join((*PERSPECTIVE, FISHEYE))}"
+            if model not in (known := (*PERSPECTIVE, FISHEYE, PANORAMA)):
+                expected = f"expected one of {', '.join(known)}"
                 raise ValueError(f"{path}: {unsupported_model(model, f'{expected}: export undistorted images')}")
 
     def file(self, frame: dict[str, Any], key: str) -> Path | None:
@@ -197,16 +197,22 @@ class Transforms:
             width, height = (round(self._number(frame, key)) for key in ("w", "h"))
         else:
             width, height = self._size(frame, image)
-        if (focal := self._focal(frame, "fl_x", "camera_angle_x", width)) is None:
-            raise ValueError(self._without_focal(frame))
-        focal_y = self._focal(frame, "fl_y", "camera_angle_y", height)
         center = self._number(frame, "cx", width / 2), self._number(frame, "cy", height / 2)
+        if self._model(frame) == PANORAMA:
+            half_turn = self._number(frame, "fl_x", width / 2), self._number(frame, "fl_y", float(height))
+            focal = half_turn[0] / math.pi, half_turn[1] / math.pi
+            return self._checked(Lens(width, height, focal, center, model="equirectangular"))
+        if (focal_x := self._focal(frame, "fl_x", "camera_angle_x", width)) is None:
+            raise ValueError(self._without_focal(frame))
+        focal = focal_x, self._focal(frame, "fl_y", "camera_angle_y", height) or focal_x
         k1, k2, k3, k4, p1, p2 = (self._number(frame, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-        lens = Lens(width, height, (focal, focal_y or focal), center, (k1, k2, p1, p2, k3))
         if self._model(frame) == FISHEYE:
-            lens = replace(lens, coefficients=(k1, k2, k3, k4), model="fisheye")
-        elif k4:
+            return self._checked(Lens(width, height, focal, center, (k1, k2, k3, k4), "fisheye"))
+        if k4:
             raise ValueError(f"{self.path}: k4 must be 0, got {k4}; undistort the images first")
+        return self._checked(Lens(width, height, focal, center, (k1, k2, p1, p2, k3)))
+
+    def _checked(self, lens: Lens) -> Lens:
         try:
             return lens.checked()
         except ValueError as error:
