@@ -31,7 +31,7 @@ ORDER = [
     "initialization",
     "training prepare",
     "bench export viewer report",
-    "sweep",
+    "sweep demo",
     "cli",
 ]
 """The layers of the package: each may import from its own line and from those above it."""

@@ -43,9 +43,7 @@ def _imported(name: str) -> Any:
 
 
 COMMANDS = {
-    "sample": Command(
-        ".prepare.options:Sample", ".prepare.command:run_sample", "write a short video to try prepare on"
-    ),
+    "demo": Command(".demo:Demo", ".demo:run", "go from a ray-traced video to a trained scene, to see how it works"),
     "download": Command(
         ".download.options:Download", ".download.command:run", "download public captures: NeRF-DS, HyperNeRF, D-NeRF"
     ),

@@ -1,9 +1,9 @@
-"""The commands ``warpgs prepare`` and ``warpgs sample``."""
+"""The command ``warpgs prepare``."""
 
 from warpgs.command_line.screen import show
-from warpgs.errors import command, ending_at_once, terminable
+from warpgs.errors import ending_at_once, terminable
 
-from .options import Prepare, Sample
+from .options import Prepare
 
 USED_BY_ADD = ("paths", "add", "options", "masks", "depth", "weights", "quiet")
 """Options that mean something with ``--add``."""
@@ -46,13 +46,3 @@ def _check_alone(options: Prepare) -> None:
             if name not in USED_BY_ADD and getattr(given, name) != value:
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(f"{option} cannot be used with --add, which keeps the frames and cameras")
-
-
-def run_sample(options: Sample) -> None:
-    """Writes the video and says how to go on; raises as ``write_sample``."""
-    with ending_at_once():
-        from .frames.sample import write_sample  # imports torch and Warp
-    log = None if options.quiet else show
-    write_sample(options.video, log=log)
-    if log is not None:
-        log(f"{options.video} is finished: next run {command('prepare', options.video, 'CAPTURE', '--holdout', 8)}")

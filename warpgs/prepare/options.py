@@ -1,4 +1,4 @@
-"""Options of ``warpgs prepare`` and ``warpgs sample``."""
+"""Options of ``warpgs prepare``."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -95,15 +95,5 @@ class Prepare:
     options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
     force: bool = False
     """Replace an existing capture of prepare; other files are kept."""
-    quiet: bool = False
-    """Print errors only."""
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Writes a short ray-traced video, as a hand-held camera records it, to try ``warpgs prepare`` on."""
-
-    video: Annotated[Path, tyro.conf.arg(metavar="VIDEO"), tyro.conf.Positional]
-    """File to write, such as sample.mp4."""
     quiet: bool = False
     """Print errors only."""

@@ -6,7 +6,6 @@ import av
 import numpy as np
 import pytest
 
-from warpgs.cli import main
 from warpgs.prepare.frames import sample
 from warpgs.prepare.frames.sample import SampleSize, write_sample
 
@@ -51,28 +50,20 @@ def test_what_cannot_be_written_is_refused_before_anything_is_traced(name, size,
     assert not any(tmp_path.iterdir())
 
 
-def test_the_command_says_what_it_does_before_it_does_it_unless_it_is_quiet(tmp_path, monkeypatch, capsys):
-    printed = []
-    frame = sample._frame
-    monkeypatch.setattr(sample, "SampleSize", lambda: TINY)
-    monkeypatch.setattr(sample, "_frame", lambda *a: printed.append(capsys.readouterr().out) or frame(*a))
+def test_what_is_traced_is_said_first_unless_it_is_quiet(tmp_path, monkeypatch, capsys):
+    said = []
+    monkeypatch.setattr(sample, "_frame", lambda *a, frame=sample._frame: said.append(len(said)) or frame(*a))
     path = tmp_path / "sample.mp4"
-    assert main(["sample", str(path)]) == 0
-    assert printed[0] == f"tracing 10 frames of 96×64 for {path}\n"
-    assert "next run" in capsys.readouterr().out
-    printed.clear()
-    assert main(["sample", str(tmp_path / "quiet.mp4"), "--quiet"]) == 0
-    assert "".join(printed) + capsys.readouterr().out == ""
+    write_sample(path, TINY, log=lambda line: said.append(line))
+    assert said[0] == f"tracing 10 frames of 96×64 for {path}"
+    capsys.readouterr()
+    write_sample(tmp_path / "quiet.mp4", TINY)
+    assert capsys.readouterr() == ("", "")
 
 
-def test_the_command_says_what_to_run_next(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sample, "SampleSize", lambda: TINY)
+def test_a_video_that_exists_is_kept(tmp_path):
     path = tmp_path / "sample.mp4"
-    assert main(["sample", str(path)]) == 0
-    assert f"next run warpgs prepare {path} CAPTURE" in capsys.readouterr().out
-    assert main(["sample", str(tmp_path / "sample.txt")]) == 2
-    assert "must end with" in capsys.readouterr().err
-    before = path.read_bytes()
-    assert main(["sample", str(path)]) == 2
-    assert f"{path} exists: give another name" in capsys.readouterr().err
-    assert path.read_bytes() == before
+    path.write_bytes(b"mine")
+    with pytest.raises(ValueError, match=r"sample\.mp4 exists: give another name"):
+        write_sample(path, TINY)
+    assert path.read_bytes() == b"mine"
