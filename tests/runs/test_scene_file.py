@@ -88,6 +88,14 @@ def test_what_is_made_of_a_file_is_in_a_folder_of_its_name(tmp_path, name, folde
     assert open_scene(write(tmp_path / name, scenes.cloud(3)), "cpu").folder == tmp_path / folder
 
 
+def test_commands_open_a_scene_by_its_path(file, sequence, finished_run):
+    """As the viewer's button that renders a video does."""
+    for path in (file, sequence, finished_run):
+        opened = open_scene(path, "cpu")
+        assert opened.path == path
+        assert repr(open_scene(opened.path, "cpu")) == repr(opened)
+
+
 @pytest.mark.parametrize("path", ["fixed", "spiral", "bullet", "frozen", "moving"])
 def test_paths_lead_around_a_file(file, tmp_path, path):
     render_run(Render(file, path=path, frames=3, write="png", device="cpu", quiet=True))

@@ -83,7 +83,7 @@ def opened(folder, browser):
     controls = SimpleNamespace(**{name: Control("path") for name in CONTROLS})
     controls.duration.value, controls.rate.value, controls.size.value = 5.0, 24.0, (64.0, 48.0)
     controls.download.disabled = True
-    run = SimpleNamespace(folder=folder, device=torch.device("cpu"))
+    run = SimpleNamespace(folder=folder, path=folder, device=torch.device("cpu"))
     made = PathEditor(Scene(), controls, run, browser, 0.1, TRAINING.capture)
     made.click = lambda name: getattr(controls, name).click()
     made.controls, made.browser = controls, made._browser

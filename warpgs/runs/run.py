@@ -107,6 +107,11 @@ class Run:
         return Run(folder, config)
 
     @property
+    def path(self) -> Path:
+        """What commands open it by."""
+        return self.folder
+
+    @property
     def has_capture(self) -> bool:
         """Whether a capture is known."""
         return True

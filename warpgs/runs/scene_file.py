@@ -44,6 +44,10 @@ class SceneFile(Run):
         return f"<SceneFile {self.files[0]}{last}>"
 
     @property
+    def path(self) -> Path:
+        return self.folder if len(self.files) > 1 else self.files[0]
+
+    @property
     def has_capture(self) -> bool:
         return self.config.data is not None
 

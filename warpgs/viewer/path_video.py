@@ -65,7 +65,7 @@ class PathVideo:
         with self._lock:
             if self._is_stopped or (self._child is not None and self._child.poll() is None):
                 return
-            command = [sys.executable, "-m", "warpgs", "render", str(folder), "--keyframes", str(path)]
+            command = [sys.executable, "-m", "warpgs", "render", str(self._run.path), "--keyframes", str(path)]
             command += [
                 "--write",
                 "mp4",
