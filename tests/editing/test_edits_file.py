@@ -109,7 +109,7 @@ def test_saved_edits_apply_to_exports_renders_and_the_viewer(run, capsys):
     assert (run.parent / "second" / "00000.png").read_bytes() == (run.parent / "first" / "00000.png").read_bytes()
     source = open_source(run, "cpu", False)
     assert source.edit(Editing(), Run.open(run, "cpu").open_corrected_capture(True)) != []
-    shown = source.current()
+    shown = source.edited(source.edits)
     assert len(shown.scene.static) + len(shown.scene.dynamic) == 9
     assert {path.name: path.read_bytes() for path in checkpoint.list_checkpoints(run)} == before
 

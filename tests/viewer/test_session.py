@@ -161,7 +161,7 @@ def looking(pose, time, wipe=0.0):
     """A session that looks with a pose at a time, with the second training camera selected; it renders nothing."""
     here = session(view=2, width=640, layer="joint", residual=True, time=time, wipe=wipe)
     here._pose, here._training, here._clock, here._resolution = lambda: pose, TRAINING, Clock(), AdaptiveResolution()
-    here._source = SimpleNamespace(current=object)
+    here._source, here.cleanup = SimpleNamespace(), SimpleNamespace(scene=object)
     here._frustums = SimpleNamespace(visible=True)
     here._requested = here._shown = None
     here._changed_at = 0.0

@@ -4,6 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from warpgs.editing.options import Edits
+
 from .browser_camera import BrowserCamera
 from .panel import Panel
 from .path_editor import PathEditor, PathState
@@ -23,6 +25,7 @@ class PageState(NamedTuple):
         controls: Values of the controls of the panel, by name.
         training_view: Number of the training camera that the slider selects, from 1; None without training cameras.
         path: Its keyframes.
+        edits: Its edits.
     """
 
     camera: BrowserCamera
@@ -30,6 +33,7 @@ class PageState(NamedTuple):
     controls: dict[str, Any]
     training_view: int | None
     path: PathState
+    edits: Edits
 
     @property
     def pose(self) -> Pose:
@@ -37,8 +41,8 @@ class PageState(NamedTuple):
         return Pose(tuple(self.orientation.tolist()), tuple(self.camera.position.tolist()), self.camera.fov)
 
     @staticmethod
-    def of(steering: Steering, panel: Panel, has_training_cameras: bool, path: PathEditor) -> "PageState":
+    def of(steering: Steering, panel: Panel, has_training_cameras: bool, path: PathEditor, edits: Edits) -> "PageState":
         """The current state of a page."""
         controls = {name: getattr(panel, name).value for name in KEPT}
         training_view = panel.view.value if has_training_cameras else None
-        return PageState(steering.seen(), steering.orientation, controls, training_view, path.state())
+        return PageState(steering.seen(), steering.orientation, controls, training_view, path.state(), edits)

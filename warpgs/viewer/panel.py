@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from .cleanup_controls import CleanupControls
 from .layers import LAYERS
 from .path_controls import PathControls
 from .status import status_html
@@ -31,7 +32,7 @@ class Panel:
             timeline is one of them instead of lying below the image.
 
     Attributes:
-        path: The controls of camera paths.
+        path, cleanup: The controls of camera paths, and of edits.
         timeline: The timeline below the image; None in the panel.
     """
 
@@ -59,7 +60,7 @@ class Panel:
             self.screenshot = gui.add_button("Screenshot", hint="Downloads the image at this width as a PNG file")
         if training is not None:
             self._add_training(gui, training, is_narrow)
-        self.path = PathControls(gui)
+        self.path, self.cleanup = PathControls(gui), CleanupControls(gui)
         with gui.add_folder("Help", expand_by_default=False):
             gui.add_markdown(HELP)
 
@@ -74,22 +75,22 @@ class Panel:
     @property
     def current_time(self) -> float:
         """Time to show, in [0, 1]."""
-        return _clamped(self.time.value, TIMES)
+        return clamped(self.time.value, TIMES)
 
     @property
     def current_speed(self) -> float:
         """Speed of playback."""
-        return _clamped(self.speed.value, SPEEDS)
+        return clamped(self.speed.value, SPEEDS)
 
     @property
     def current_width(self) -> int:
         """Width of the image at rest [px]."""
-        return int(_clamped(self.width.value, WIDTHS))
+        return int(clamped(self.width.value, WIDTHS))
 
     @property
     def current_wipe(self) -> float:
         """Part of the image of a training camera that shows the truth, in [0, 1]; 0 without training cameras."""
-        return _clamped(self.wipe.value, (0.0, 1.0)) if hasattr(self, "wipe") else 0.0
+        return clamped(self.wipe.value, (0.0, 1.0)) if hasattr(self, "wipe") else 0.0
 
     @property
     def shows_cameras(self) -> bool:
@@ -115,7 +116,7 @@ class Panel:
             self.truth = gui.add_image(image, label="training image")
 
 
-def _clamped(value: int | float, bounds: tuple[int | float, int | float]) -> float:
+def clamped(value: int | float, bounds: tuple[int | float, int | float]) -> float:
     """A number within bounds; the lower bound for NaN."""
     low, high = bounds
     return float(min(value, high)) if value >= low else float(low)

@@ -19,6 +19,7 @@ from . import comparison
 from .adaptive_resolution import AdaptiveResolution
 from .browser_camera import set_camera, through_training_camera
 from .canvas import NARROW, canvas_of, size_at
+from .cleanup import Cleanup
 from .clock import Clock
 from .comparison import with_truth
 from .frustums import FRUSTUMS, show_training
@@ -100,9 +101,9 @@ class Session:
         path, filmed = (None, None) if training is None else (training.path, training.filmed)
         self._steering = Steering(client.camera, path, filmed)
         self.panel = Panel(client.gui, training, width, is_narrow=self._canvas()[0] < NARROW)
-        scale = KEYFRAME_SCALE if training is None else training.frustum_scale
-        capture = None if training is None else training.capture
+        scale, capture = (KEYFRAME_SCALE, None) if training is None else (training.frustum_scale, training.capture)
         self.path = PathEditor(client.scene, self.panel.path, source.run, self, scale, capture)
+        self.cleanup = Cleanup(client.scene, self.panel.cleanup, source, rendering, self._wake.set)
         self._frustums = client.scene.add_frame(FRUSTUMS, show_axes=False, visible=False)
         if view is not None:
             self._restore(view)
@@ -126,10 +127,11 @@ class Session:
 
     def view(self) -> PageState:
         """What the browser shows."""
-        return PageState.of(self._steering, self.panel, self._training is not None, self.path)
+        return PageState.of(self._steering, self.panel, self._training is not None, self.path, self.cleanup.edits)
 
     def _restore(self, view: PageState) -> None:
         self.path.restore(view.path)
+        self.cleanup.restore(view.edits)
         for name, value in view.controls.items():
             set_value(getattr(self.panel, name), value)
         if self._training is not None and view.training_view is not None:
@@ -314,7 +316,7 @@ class Session:
 
     def _request(self) -> RenderRequest | None:
         """The image that the camera and the controls ask for; None without a scene."""
-        scene, panel = self._source.current(), self.panel
+        scene, panel = self.cleanup.scene(), self.panel
         if scene is None:
             return None
         controls = (panel.current_width, panel.current_layer, bool(panel.residual.value), panel.current_time)
@@ -342,8 +344,7 @@ class Session:
         """Renders an image and sends it to the browser."""
         rendered = self._renderer.render(request, scale)
         start = time.perf_counter() - rendered.seconds  # without waiting for the images of other browsers
-        quality = QUALITY_AT_REST if scale == 1 else QUALITY
-        image = with_truth(rendered.image, request, self._training)
+        image, quality = with_truth(rendered.image, request, self._training), QUALITY_AT_REST if scale == 1 else QUALITY
         self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
         now = time.perf_counter()
         width, height = request.size_at(scale)
@@ -392,8 +393,7 @@ class Session:
         notes = [n for n in (self._problem, leaves, self._note, hidden, self._source.note, self._source.progress) if n]
         lines = []
         if self._shown is not None:
-            recent = sum(now - sent < RATE_SECONDS for sent in self._sent)
-            cost, rate = self._cost
+            recent, (cost, rate) = sum(now - sent < RATE_SECONDS for sent in self._sent), self._cost
             lines = about(self._shown.request.scene, cost, recent / RATE_SECONDS if recent > 2 else rate)
         text = status_html(lines, notes)
         if text != self.panel.status.content:

@@ -7,13 +7,17 @@ from pathlib import Path
 import torch
 
 from warpgs.data.capture import Capture
-from warpgs.editing.edited_scene import with_edits
-from warpgs.editing.options import Editing
+from warpgs.editing.edited_scene import edited, with_edits
+from warpgs.editing.edits_file import edits_in_use, save_edits
+from warpgs.editing.options import Editing, Edits
 from warpgs.errors import one_line
 from warpgs.runs import preview
 from warpgs.runs.opening import open_scene
 from warpgs.runs.run import Device, Run
 from warpgs.runs.trained import TrainedScene
+
+MAX_EDITED = 3
+"""Maximum number of edits whose scenes are kept."""
 
 POLL_SECONDS = 2.0
 """Interval between checks for a newer checkpoint while a browser is connected [s]."""
@@ -30,6 +34,7 @@ class Source:
     Attributes:
         run: The run.
         note: Why there is no (newer) scene; empty if there is one.
+        edits: Edits that browsers begin with.
         progress: How far the training is that is followed; empty if unknown.
 
     Raises:
@@ -43,12 +48,31 @@ class Source:
         self._loaded: tuple[Path, int] | None = None
         self._checked = -POLL_SECONDS
         self._scene: TrainedScene | None = None if follow else run.trained_scene()
+        self.edits, self._editing = Edits(), Editing()
+        self._capture: Capture | None = None
+        self._edited: dict[Edits, TrainedScene] = {}
 
     def edit(self, editing: Editing, capture: Capture | None) -> list[str]:
-        """Edits the scene, which is not one that is followed; returns lines about it. Raises as ``with_edits``."""
+        """Begins with the edits of the options; returns lines about them. Raises as ``with_edits``."""
         assert self._scene is not None
-        self._scene, notes = with_edits(self._scene, self.run.folder, editing, lambda: capture)
+        self._editing, self._capture = editing, capture
+        scene, notes = with_edits(self._scene, self.run.folder, editing, lambda: capture)
+        self.edits = edits_in_use(self.run.folder, editing)
+        self._edited[self.edits] = scene
         return notes
+
+    def edited(self, edits: Edits) -> TrainedScene:
+        """The scene with other edits, which is kept for all browsers; raises as ``edited_scene.edited``."""
+        assert self._scene is not None
+        if edits not in self._edited:
+            self._edited = dict([*self._edited.items()][1 - MAX_EDITED :])
+            self._edited[edits] = edited(self._scene, edits, self._capture)
+        return self._edited[edits]
+
+    def save(self, edits: Edits) -> Path:
+        """Writes edits to the file of edits; raises as ``save_edits``, and as ``edited`` if they cannot be made."""
+        self.edited(edits)
+        return save_edits(self.run.folder, self._editing, edits)
 
     @property
     def device(self) -> torch.device:

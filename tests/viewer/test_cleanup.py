@@ -1,0 +1,230 @@
+"""Edits in the browser."""
+
+import html
+import re
+import shutil
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
+
+from tests.viewer.test_path_editor import Control
+from warpgs.editing.edits_file import NAME, read_edits
+from warpgs.editing.options import Editing, Edits
+from warpgs.runs.run import Run
+from warpgs.viewer.cleanup import Cleanup, box_edges
+from warpgs.viewer.source import MAX_EDITED, open_source
+
+pytestmark = pytest.mark.usefixtures("contracts_off", "quickly")
+
+
+class Corner:
+    """Arrows of a corner that are dragged."""
+
+    position = (0.0, 0.0, 0.0)
+
+    def on_update(self, handler):
+        self.moved = handler
+
+    def on_drag_end(self, handler):
+        self.ended = handler
+
+    def drag(self, position):
+        self.position = position
+        self.moved(None)
+        self.ended(None)
+
+
+class Scene:
+    """The scene of a browser, with the corners and the edges of the box."""
+
+    def __init__(self):
+        self.shown = {}
+
+    def add_transform_controls(self, name, *_, **__):
+        self.shown[name] = Corner()
+        return self.shown[name]
+
+    def add_line_segments(self, name, points, *_, **__):
+        self.shown[name] = points
+
+    def remove_by_name(self, name):
+        self.shown = {other: value for other, value in self.shown.items() if not other.startswith(name)}
+
+
+@pytest.fixture
+def run(finished_run, tmp_path):
+    return shutil.copytree(finished_run, tmp_path / "run")
+
+
+def opened(run, editing=None):
+    """A browser that has opened a run, and its source."""
+    source = open_source(run, "cpu", False)
+    source.edit(editing or Editing(), Run.open(run, "cpu").open_corrected_capture(True))
+    return visited(source)
+
+
+def visited(source):
+    controls = SimpleNamespace(**{name: Control() for name in ("crop", "opacity", "floaters", "undo", "save", "note")})
+    woken = []
+    made = Cleanup(Scene(), controls, source, threading.Lock(), lambda: woken.append(1))
+    made.controls, made.woken, made.browser, made.source = controls, woken, made._scene, source
+    return made
+
+
+@pytest.fixture
+def cleanup(run):
+    return opened(run)
+
+
+def count(cleanup):
+    scene = cleanup.scene().scene
+    return len(scene.static) + len(scene.dynamic)
+
+
+def note(cleanup):
+    return html.unescape(re.sub("<[^>]*>", "", cleanup.controls.note.content))
+
+
+def test_without_edits_the_scene_is_the_one_of_the_run(cleanup):
+    assert cleanup.scene() is cleanup.source.current()
+    assert note(cleanup) == "no edits"
+
+
+def test_the_crop_box_begins_around_most_of_the_scene(cleanup):
+    whole = count(cleanup)
+    cleanup.controls.crop.value = True
+    assert 0.5 * whole < count(cleanup) < whole
+    means = cleanup.source.current().splats(0.5).means.numpy()
+    box = np.array(cleanup.edits.crop).reshape(2, 3)
+    inside = ((means >= box[0]) & (means <= box[1])).mean(0)
+    assert inside == pytest.approx(0.98, abs=0.03)
+    assert len(cleanup.woken) == 1
+
+
+def test_a_corner_that_is_dragged_moves_the_box_and_its_edges(cleanup):
+    cleanup.controls.crop.value = True
+    before = cleanup.edits.crop
+    corner = tuple(np.array(before[3:]) - 0.3)
+    cleanup.browser.shown["/crop/high"].drag(corner)
+    assert cleanup.edits.crop == (*before[:3], *corner)
+    edges = cleanup.browser.shown["/crop/edges"].reshape(-1, 3)
+    assert edges.max(0) == pytest.approx(np.float32(corner))
+    assert edges.min(0) == pytest.approx(np.float32(before[:3]))
+
+
+def test_without_its_checkbox_the_box_is_gone(cleanup):
+    whole = count(cleanup)
+    cleanup.controls.crop.value = True
+    cleanup.controls.crop.value = False
+    assert count(cleanup) == whole
+    assert cleanup.browser.shown == {}
+
+
+def test_opacity_and_floaters_are_edits(cleanup):
+    opacities = torch.cat([g.opacities for g in (cleanup.scene().scene.static, cleanup.scene().scene.dynamic)])
+    cleanup.controls.opacity.value = round(float(opacities.median()), 2)
+    cleanup.controls.floaters.value = True
+    assert cleanup.edits == Edits(min_opacity=cleanup.controls.opacity.value, drop_floaters=True)
+    assert note(cleanup) == "min_opacity, drop_floaters"
+    assert count(cleanup) < len(opacities)
+
+
+def test_undo_goes_back_edit_by_edit_and_a_slider_is_one(cleanup):
+    cleanup.controls.floaters.value = True
+    for value in (0.1, 0.2, 0.3):
+        cleanup.controls.opacity.value = value
+    cleanup.controls.undo.click()
+    assert cleanup.edits == Edits(drop_floaters=True)
+    assert cleanup.controls.opacity.value == 0.0
+    cleanup.controls.undo.click()
+    cleanup.controls.undo.click()
+    assert cleanup.edits == Edits()
+    assert cleanup.controls.floaters.value is False
+
+
+def test_edits_that_leave_nothing_are_undone_with_a_reason(cleanup):
+    before = cleanup.scene()
+    cleanup.controls.opacity.value = 1.0
+    assert cleanup.scene() is before
+    assert cleanup.edits == Edits()
+    assert note(cleanup).startswith("edits leave no Gaussian")
+
+
+@pytest.mark.parametrize("position", [(np.nan, 0.0, 0.0), (1e30, 0.0, 0.0)])
+def test_positions_that_no_box_has_are_refused(cleanup, position):
+    cleanup.controls.crop.value = True
+    before = cleanup.edits
+    cleanup.browser.shown["/crop/high"].drag(position)
+    assert cleanup.edits == before
+    assert "--crop must be six numbers" in note(cleanup)
+    assert cleanup.browser.shown["/crop/high"].position == pytest.approx(before.crop[3:])
+
+
+def test_saved_edits_are_those_that_the_next_viewer_begins_with(cleanup, run):
+    cleanup.controls.crop.value = True
+    cleanup.controls.floaters.value = True
+    cleanup.controls.save.click()
+    assert read_edits(run / NAME) == cleanup.edits
+    assert note(cleanup) == "saved as edits.json"
+    later = opened(run)
+    assert later.edits == cleanup.edits
+    assert later.controls.crop.value is True
+    assert count(later) == count(cleanup)
+    assert "/crop/low" in later.browser.shown
+
+
+def test_edits_that_leave_nothing_are_not_saved(cleanup, run):
+    cleanup.controls.opacity.value = 1.0
+    cleanup.controls.save.click()
+    assert note(cleanup).startswith("edits leave no Gaussian")
+    assert not (run / NAME).exists()
+
+
+def test_edits_of_the_command_can_be_changed_in_the_browser(run):
+    cleanup = opened(run, Editing(Edits(max_gaussians=9)))
+    assert count(cleanup) == 9
+    cleanup.controls.floaters.value = True
+    assert cleanup.edits == Edits(max_gaussians=9, drop_floaters=True)
+    cleanup.controls.undo.click()
+    cleanup.controls.undo.click()
+    assert cleanup.edits == Edits(max_gaussians=9)
+
+
+def test_browsers_share_the_scenes_of_the_last_edits(cleanup):
+    other = visited(cleanup.source)
+    for browser in (cleanup, other):
+        browser.controls.floaters.value = True
+    assert cleanup.scene() is other.scene()
+    for k in range(5):
+        cleanup.source.edited(Edits(max_gaussians=k + 1))
+    assert len(cleanup.source._edited) == MAX_EDITED
+
+
+def test_a_page_that_is_reloaded_keeps_its_edits(cleanup):
+    cleanup.controls.crop.value = True
+    other = visited(cleanup.source)
+    other.restore(cleanup.edits)
+    assert other.controls.crop.value is True
+    assert count(other) == count(cleanup)
+
+
+def test_a_training_that_is_followed_is_not_edited(run):
+    cleanup = visited(open_source(run, "cpu", True))
+    assert cleanup.controls.crop.disabled
+    cleanup.controls.floaters.value = True
+    cleanup.controls.save.click()
+    assert cleanup.edits == Edits()
+    assert not (run / NAME).exists()
+
+
+def test_a_box_has_twelve_edges_along_its_axes():
+    edges = box_edges(np.zeros(3, np.float32), np.float32([1, 2, 3]))
+    along = np.abs(edges[:, 1] - edges[:, 0])
+    assert sorted(along.sum(1).tolist()) == [1] * 4 + [2] * 4 + [3] * 4
+    assert ((along > 0).sum(1) == 1).all()
+    assert len({tuple(sorted(map(tuple, edge.tolist()))) for edge in edges}) == 12

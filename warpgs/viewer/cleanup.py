@@ -1,0 +1,206 @@
+"""Edits in the browser: a crop box with two corners to drag, opacity, floaters, undo; saved as the file of edits."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import viser
+from jaxtyping import Float32
+
+from warpgs.editing.edits_file import check
+from warpgs.editing.options import Box, Edits
+from warpgs.errors import one_line
+from warpgs.runs.trained import TrainedScene
+
+from .cleanup_controls import OPACITIES, CleanupControls
+from .panel import clamped, set_value
+from .path_controls import note_html
+from .source import Source
+
+BOX = "/crop"
+"""Path of the box in the scene of the browser."""
+
+CORNERS = ("low", "high")
+COLOR = (255, 160, 60)
+LINE_PIXELS = 1.5
+
+HANDLE_SIZE = 0.15
+"""Size of the arrows of a corner, relative to the diagonal of the box."""
+
+QUANTILES = (0.01, 0.99)
+"""Of the Gaussians' centres, along each axis: where a new box begins and ends."""
+
+MAX_UNDO = 100
+"""Maximum number of edits that can be undone."""
+
+
+class Cleanup:
+    """The edits of one browser.
+
+    Args:
+        scene: Scene of the browser, for the box.
+        controls: Its controls.
+        source: The scene that is edited, and its edits so far.
+        rendering: Lock of ``Renderer``, held while contributions are measured.
+        wake: Called after a change.
+
+    Attributes:
+        edits: The edits in use.
+    """
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        controls: CleanupControls,
+        source: Source,
+        rendering: threading.Lock,
+        wake: Callable[[], None],
+    ) -> None:
+        self._scene, self._controls, self._source = scene, controls, source
+        self._rendering, self._wake, self._lock = rendering, wake, threading.RLock()
+        self._before: list[Edits] = []
+        self._last = ""  # name of the edit that was changed last
+        self._handles: list[Any] = []
+        self._is_setting = False
+        self._shown: tuple[Edits, TrainedScene] | None = None
+        shown = source.current()
+        self._can_edit = not source.follow and shown is not None and not shown.varies
+        for control in (controls.crop, controls.opacity, controls.floaters, controls.undo, controls.save):
+            control.disabled = not self._can_edit
+        self.edits = source.edits
+        self._set_controls()
+        controls.crop.on_update(lambda _: self._crop())
+        controls.opacity.on_update(
+            lambda _: self._change("min_opacity", clamped(controls.opacity.value, OPACITIES) or None)
+        )
+        controls.floaters.on_update(lambda _: self._change("drop_floaters", bool(controls.floaters.value)))
+        controls.undo.on_click(lambda _: self._undo())
+        controls.save.on_click(lambda _: self._save())
+
+    def scene(self) -> TrainedScene | None:
+        """The scene to show; None before the first checkpoint of a training. Edits that leave nothing are undone."""
+        scene, edits = self._source.current(), self.edits
+        if scene is None or not self._can_edit:
+            return scene
+        if self._shown is None or self._shown[0] != edits:
+            try:
+                with self._rendering:
+                    self._shown = edits, self._source.edited(edits)
+            except ValueError as error:
+                self._undo(one_line(error))
+                return scene if self._shown is None else self._shown[1]
+        return self._shown[1]
+
+    def restore(self, edits: Edits) -> None:
+        """Makes the edits of a page that was reloaded."""
+        with self._lock:
+            self.edits = edits
+            self._set_controls()
+
+    def _change(self, name: str, value: Any) -> None:
+        """Replaces an edit; changes of one slider are one step of undo."""
+        with self._lock:
+            if self._is_setting or not self._can_edit or getattr(self.edits, name) == value:
+                return
+            changed = replace(self.edits, **{name: value})
+            try:
+                check(changed)
+            except ValueError as error:  # a browser may send anything
+                self._set_controls()
+                self._note(str(error))
+                return
+            if name != self._last or name != "min_opacity":
+                self._before = [*self._before, self.edits][-MAX_UNDO:]
+            self.edits, self._last = changed, name
+            self._set_controls()
+        self._wake()
+
+    def _undo(self, reason: str = "") -> None:
+        with self._lock:
+            self.edits = self._before.pop() if self._before else self._source.edits
+            self._last = ""
+            self._set_controls()
+            if reason:
+                self._note(reason)
+        self._wake()
+
+    def _save(self) -> None:
+        if not self._can_edit:
+            return
+        try:
+            with self._rendering:
+                path = self._source.save(self.edits)
+            self._note(f"saved as {path.name}")
+        except (ValueError, OSError) as error:
+            self._note(one_line(error))
+
+    def _crop(self) -> None:
+        """Shows a box around most of the scene, or none."""
+        if not self._controls.crop.value:
+            self._change("crop", None)
+        elif self.edits.crop is None and (scene := self._source.current()) is not None:
+            means = scene.splats(0.5).means.cpu().numpy()
+            corners = np.nanquantile(means, QUANTILES, axis=0)
+            self._change("crop", tuple(corners.ravel().tolist()))
+
+    def _set_controls(self) -> None:
+        """Shows the edits in the controls, and the box in the scene."""
+        controls, edits = self._controls, self.edits
+        self._is_setting = True
+        set_value(controls.crop, edits.crop is not None)
+        set_value(controls.opacity, edits.min_opacity or 0.0)
+        set_value(controls.floaters, edits.drop_floaters)
+        self._is_setting = False
+        made = [name for name in ("crop", "min_opacity", "drop_floaters", "max_gaussians") if getattr(edits, name)]
+        self._note(", ".join(made) or "no edits")
+        self._show_box(edits.crop)
+
+    def _show_box(self, box: Box | None) -> None:
+        if box is None:
+            self._scene.remove_by_name(BOX)
+            self._handles = []
+            return
+        corners = np.array(box).reshape(2, 3)
+        if not self._handles:
+            size = HANDLE_SIZE * float(np.linalg.norm(corners[1] - corners[0]))
+            self._handles = [self._corner(name, size) for name in CORNERS]
+        for handle, corner in zip(self._handles, corners, strict=True):
+            handle.position = corner
+        self._draw()
+
+    def _corner(self, name: str, size: float) -> Any:
+        """Arrows to drag a corner by."""
+        handle = self._scene.add_transform_controls(f"{BOX}/{name}", size, disable_rotations=True, depth_test=False)
+        handle.on_update(lambda _: self._draw())
+        handle.on_drag_end(lambda _: self._change("crop", self._dragged()))
+        return handle
+
+    def _dragged(self) -> Box:
+        """The box between the corners as they are by now."""
+        x, y, z, u, v, w = (float(value) for handle in self._handles for value in handle.position)
+        return x, y, z, u, v, w
+
+    def _draw(self) -> None:
+        """Draws the edges of the box."""
+        if self._handles:
+            edges = box_edges(*(np.array(handle.position, np.float32) for handle in self._handles))
+            name = f"{BOX}/edges"
+            self._scene.add_line_segments(name, edges, COLOR, thickness=LINE_PIXELS, thickness_units="screen")
+
+    def _note(self, text: str) -> None:
+        self._controls.note.content = note_html(text)
+
+
+def box_edges(low: Float32[np.ndarray, "3"], high: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "12 2 3"]:
+    """The edges of a box, by two opposite corners."""
+    ends = np.stack([low, high])
+    edges = []
+    for axis in range(3):
+        for a in (0, 1):
+            for b in (0, 1):
+                picks = np.zeros((2, 3), int)
+                picks[:, (axis + 1) % 3], picks[:, (axis + 2) % 3], picks[1, axis] = a, b, 1
+                edges.append(ends[picks, np.arange(3)])
+    return np.stack(edges)

@@ -1,0 +1,25 @@
+"""The controls of edits."""
+
+import viser
+
+from .path_controls import note_html
+
+OPACITIES = (0.0, 1.0)
+"""Range of the slider of opacity."""
+
+
+class CleanupControls:
+    """A folder of controls; ``Cleanup`` implements what they do."""
+
+    def __init__(self, gui: viser.GuiApi) -> None:
+        with gui.add_folder("Clean up", expand_by_default=False):
+            hint = "Removes what is outside of a box at all times: drag the arrows of its corners"
+            self.crop = gui.add_checkbox("crop box", False, hint=hint)
+            hint = "Removes what is fainter at all times"
+            self.opacity = gui.add_slider("min opacity", *OPACITIES, 0.01, 0.0, hint=hint)
+            hint = "Removes isolated Gaussians that the training cameras see little of"
+            self.floaters = gui.add_checkbox("drop floaters", False, hint=hint)
+            self.undo = gui.add_button("Undo", hint="The last edit")
+            hint = "For all later commands, in the run folder as edits.json; the checkpoint stays as it is"
+            self.save = gui.add_button("Save as edits", hint=hint)
+            self.note = gui.add_html(note_html("no edits"))
