@@ -43,7 +43,7 @@ STAMPS = {
 def test_time_stamps_are_read_as_seconds(kind):
     index = {STAMPS[kind](k, *divmod(START + k * STEP, SECOND)): k for k in range(7)}
     names = sorted(index, key=natural_order)
-    times, source, are_read = times_of_names(names)
+    times, source, are_read, _ = times_of_names(names)
     assert are_read
     assert np.allclose(times, [index[name] * STEP / SECOND for name in names], atol=2e-3)
     assert source == TimeSource("times from the time stamps in the names, 0.133 s apart")
@@ -73,7 +73,7 @@ def test_dates_are_read_across_minutes(pattern):
 )
 def test_times_of_day_without_a_date_go_on_after_midnight_and_that_is_said(pattern):
     names = sorted(pattern.format(s // 3600 % 24, s // 60 % 60, s % 60) for s in range(86_390, 86_420, 2))
-    times, source, _ = times_of_names(names)
+    times, source, *_ = times_of_names(names)
     assert times == [*range(10, 30, 2), *range(0, 10, 2)]
     last, first = (pattern.format(*time) for time in ((23, 59, 58), (0, 0, 0)))
     assert source.problem == f"they are taken to go on after midnight, from {last} to {first}"
@@ -82,7 +82,7 @@ def test_times_of_day_without_a_date_go_on_after_midnight_and_that_is_said(patte
 def test_times_of_day_with_a_long_pause_stay_on_one_day():
     """An hour lies between the last one and midnight."""
     names = [f"{hour:02d}-00-{s:02d}.png" for hour in (0, 23) for s in range(0, 20, 2)]
-    times, source, _ = times_of_names(names)
+    times, source, *_ = times_of_names(names)
     assert max(times) < 86_400
     assert times == sorted(times)
     assert "midnight" not in source.problem
@@ -139,7 +139,7 @@ def test_numbers_that_tell_frames_apart_are_their_times(kind):
     ],
 )
 def test_names_are_counted_where_their_numbers_are_no_times_and_the_reason_is_said(names, reason):
-    times, source, are_read = times_of_names(names)
+    times, source, are_read, _ = times_of_names(names)
     assert (times, are_read) == ([float(k) for k in range(len(names))], False)
     assert source.text.startswith("times from the sorted order of the names, because ")
     assert reason in source.text
@@ -148,14 +148,14 @@ def test_names_are_counted_where_their_numbers_are_no_times_and_the_reason_is_sa
 
 @pytest.mark.parametrize("prefix", ["DSC_", "DSC0"])
 def test_the_counter_of_a_camera_may_begin_again_after_9999(prefix):
-    times, source, _ = times_of_names([f"{prefix}{k:04d}.JPG" for k in (1, 2, 9997, 9998, 9999)])
+    times, source, *_ = times_of_names([f"{prefix}{k:04d}.JPG" for k in (1, 2, 9997, 9998, 9999)])
     assert times == [4.0, 5.0, 0.0, 1.0, 2.0]
     between = f"there are none between {prefix}0002.JPG and {prefix}9997.JPG"
     assert f"begin again after 9999, as {between}" in source.problem
 
 
 def test_a_long_gap_between_time_stamps_stays_and_is_a_problem():
-    times, source, _ = times_of_names([f"{1305031102 + t:.2f}.png" for t in (0, 0.25, 0.5, 0.75, 90)])
+    times, source, *_ = times_of_names([f"{1305031102 + t:.2f}.png" for t in (0, 0.25, 0.5, 0.75, 90)])
     assert times == [0.0, 0.25, 0.5, 0.75, 90.0]
     assert source.text.endswith("22.5 s apart on average, largest gap 89.2 s")
     assert "nearly all of the time is from 1305031102.75.png to 1305031192.00.png" in source.problem

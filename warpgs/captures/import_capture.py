@@ -49,9 +49,9 @@ def import_capture(
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{target} is not an empty folder: choose a new one for the capture")
     capture, renamed = _with_plain_ids(load_capture(source, dataset, factor=factor, cache_frames=2))
-    names = capture.in_time((*capture.train, *capture.val))
-    by_camera = [name for frames in capture.by_camera(names).values() for name in frames]
-    val = list(capture.val) if holdout is None else writer.held_out(by_camera, holdout)
+    of_cameras = capture.by_camera((*capture.train, *capture.val)).values()
+    names = [name for frames in of_cameras for name in frames]  # videos are decoded in the order of their frames
+    val = list(capture.val) if holdout is None else writer.held_out(names, holdout)
     with complete_or_absent(target) as folder:
         counts = _write_frames(folder, capture, names, quiet=log is None)
         _write_index(folder, capture, names, val)

@@ -33,11 +33,12 @@ PANORAMA = "EQUIRECTANGULAR"
 
 
 class ModelImage(NamedTuple):
-    """An image of a model: its file name, lens, and [3, 4] world-to-camera pose."""
+    """An image of a model: its file name, lens, [3, 4] world-to-camera pose, and the id of its camera."""
 
     name: str
     lens: Lens
     pose: Float[np.ndarray, "3 4"]
+    camera: int
 
 
 class Model(NamedTuple):
@@ -65,7 +66,7 @@ def load_model(folder: Path) -> Model:
                 lens = lens_of(camera)
             except ValueError as error:
                 raise ValueError(f"{folder}: camera {image.camera_id}: {error}") from error
-            images.append(ModelImage(image.name, lens, image.cam_from_world().matrix()))
+            images.append(ModelImage(image.name, lens, image.cam_from_world().matrix(), image.camera_id))
     found = [point for _, point in sorted(model.points3D.items())]
     points = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)

@@ -76,9 +76,9 @@ def _transforms(cameras: CameraSet) -> dict[str, Any]:
 
 
 def _frame(file: str, camera: Camera) -> dict[str, Any]:
-    """Fields of a frame of a transforms.json file: camera to world with OpenGL axes, and the time."""
+    """Fields of a frame of a transforms.json file: camera to world with OpenGL axes, time, and id of the camera."""
     matrix = np.linalg.inv(camera.viewmat.double().numpy()) * np.array([1.0, -1.0, -1.0, 1.0])
-    return {"file_path": file, "transform_matrix": matrix.tolist(), "time": camera.time}
+    return {"file_path": file, "transform_matrix": matrix.tolist(), "time": camera.time, "camera_id": camera.id}
 
 
 def _write_points(path: Path, cameras: CameraSet) -> None:

@@ -21,6 +21,7 @@ from warpgs.files import read_json
 
 from .blender import BlenderLoader
 from .colmap import ColmapLoader
+from .dynerf import DynerfLoader
 from .hypernerf import HyperNerfLoader
 from .iphone import IPhoneLoader
 from .llff import LlffLoader
@@ -60,6 +61,7 @@ LOADERS: dict[str, Loader] = {
     "hypernerf": HyperNerfLoader(),
     "nerfstudio": NerfstudioLoader(),
     "blender": BlenderLoader(),
+    "dynerf": DynerfLoader(),
     "llff": LlffLoader(),
     "colmap": ColmapLoader(),
     "vipe": VipeLoader(),

@@ -103,7 +103,8 @@ def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
     names = [image.stem for image in images]
     if len(set(names)) < len(names):
         names = plain_names([transforms.image_name(entry) for entry in transforms.frames])
-    for entry, image, name, time in zip(transforms.frames, images, names, times, strict=True):
+    cameras = transforms.cameras(transforms.frames) or [0] * len(names)
+    for entry, image, name, time, camera in zip(transforms.frames, images, names, times, cameras, strict=True):
         if size is None:  # the images of these datasets have one size
             first = transforms.lens(entry, image)
             size = first.width, first.height
@@ -119,6 +120,7 @@ def _frames(transforms: Transforms, split: str) -> list[PosedFrame]:
                 partial(read_resized_over_white, image),
                 None if mask is None else partial(read_resized_mask, mask, image=image),
                 None if depth is None else partial(read_metric_depth, depth, unit=1.0, image=image),
+                camera,
             )
         )
     return frames

@@ -1,5 +1,7 @@
 """COLMAP: a model in sparse/0 (text or binary) beside images/, as 3DGS, gsplat and nerfstudio's tools write it."""
 
+from collections import Counter
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -46,11 +48,12 @@ class ColmapLoader:
         images = sorted(model.images, key=lambda image: natural_order(files.stored_name(image)))
         stored_names = [files.stored_name(image) for image in images]
         names = plain_names(stored_names)
-        times, source, _ = times_of_names(stored_names)
+        times, source, _, cameras = times_of_names(stored_names)
+        cameras = cameras if any(cameras) else _cameras(images)
         notes += model.notes
         if found.part != root:
             notes += _unused(root, found.part)
-        frames = [files.frame(name, image, time) for name, image, time in zip(names, images, times, strict=True)]
+        frames = [files.frame(*found) for found in zip(names, images, times, cameras, strict=True)]
         reason = f"the model in {found.shown(root)} has no pose for them"
         notes += turning_notes(files.used, [(image.lens.width, image.lens.height) for image in images])
         notes += [*files.images.notes, *skipped_images(root, files.used, reason, files.folder)]
@@ -79,7 +82,7 @@ class _Files:
         self._path(image)
         return self.images.as_stored(image.name)
 
-    def frame(self, name: str, image: ModelImage, time: float) -> PosedFrame:
+    def frame(self, name: str, image: ModelImage, time: float, camera: int) -> PosedFrame:
         """A frame of the model.
 
         Raises:
@@ -98,7 +101,18 @@ class _Files:
             partial(read_resized_image, path),
             None if mask is None else partial(read_resized_mask, mask, image=path),
             None if depth is None else partial(read_depth, depth, image=path),
+            camera,
         )
+
+
+def _cameras(images: Sequence[ModelImage]) -> list[int]:
+    """The camera of each image by that of the model, as in rigs; all 0 if one has a single image.
+
+    COLMAP may give every image of a video a camera of its own.
+    """
+    counts = Counter(image.camera for image in images)
+    numbers = {i: k for k, i in enumerate(sorted(counts))}
+    return [numbers[image.camera] if min(counts.values()) > 1 else 0 for image in images]
 
 
 def _unused(root: Path, part: Path) -> list[str]:

@@ -55,7 +55,7 @@ class LlffLoader:
 
     def load(self, root: Path, options: LoadOptions) -> Capture:
         """Opens a capture; errors as for ``load_with``."""
-        poses, bounds, sizes, notes = _read_poses(root / INDEX)
+        poses, bounds, sizes, notes = read_poses(root / INDEX)
         paths = _images(_image_folder(root, options.factor))
         if len(paths) != len(poses):
             raise ValueError(f"{root / INDEX} has {len(poses)} poses, but {paths[0].parent} has {len(paths)} images")
@@ -69,13 +69,13 @@ class LlffLoader:
         val = [frame.name for frame in others] if others else every_eighth(names)
         options = replace(options, factor=1)  # that of the folder
         source = TimeSource(f"times from the order of the images, one for each pose of {INDEX}")
-        world = _world(root, poses, bounds)
+        world = world_of(root, poses, bounds)
         turned = turning_notes(paths, [(lens.width, lens.height) for lens in lenses])
         world = replace(world, time_source=source, notes=(*world.notes, *notes, *turned))
         return posed_capture(root, [*frames, *others], frozenset(val), world, options)
 
 
-class _Poses(NamedTuple):
+class Poses(NamedTuple):
     """[N, 3, 4] world-to-camera poses, [N, 2] bounds, [N, 3] height, width, focal length [px], and notes."""
 
     poses: Float[np.ndarray, "N 3 4"]
@@ -84,7 +84,12 @@ class _Poses(NamedTuple):
     notes: tuple[str, ...]
 
 
-def _read_poses(path: Path) -> _Poses:
+def read_poses(path: Path) -> Poses:
+    """What a poses_bounds.npy holds.
+
+    Raises:
+        ValueError: If it is missing or damaged, or its numbers cannot be those of cameras.
+    """
     rows = read_array(path, 17 * MAX_FRAMES).astype(np.float64)
     if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0 or not np.isfinite(rows).all():
         raise ValueError(f"{path} must hold finite numbers of shape [N, 17] with N > 0, got {list(rows.shape)}")
@@ -98,7 +103,7 @@ def _read_poses(path: Path) -> _Poses:
         raise ValueError(f"{path}: {error}") from error
     if not ((bounds[:, 0] > 0) & (bounds[:, 1] > bounds[:, 0])).all() or not (matrices[:, :, 4] > 0).all():
         raise ValueError(f"{path}: bounds, sizes and focal lengths must be positive, and near less than far")
-    return _Poses(np.array(poses), bounds, matrices[:, :, 4], scale_note(path.name, scale))
+    return Poses(np.array(poses), bounds, matrices[:, :, 4], scale_note(path.name, scale))
 
 
 def _image_folder(root: Path, factor: int | None) -> Path:
@@ -127,7 +132,21 @@ def _images(folder: Path) -> list[Path]:
 
 def _lens(root: Path, path: Path, size: Float[np.ndarray, "3"]) -> Lens:
     """The lens of an image that may have been reduced since its pose was written."""
-    stored = image_size(path)
+    return lens_of_row(root, path, image_size(path), size)
+
+
+def lens_of_row(root: Path, path: Path, stored: tuple[int, int], size: Float[np.ndarray, "3"]) -> Lens:
+    """The lens of an image or video.
+
+    Args:
+        root: Folder of the capture.
+        path: The file.
+        stored: (width, height) of its images, as stored [px].
+        size: [3] height, width and focal length of its row in poses_bounds.npy, perhaps of larger images [px].
+
+    Raises:
+        ValueError: If the two sizes differ in shape, or the focal length is out of range.
+    """
     full_height, full_width, focal = size.tolist()
 
     def fits(size: tuple[int, int]) -> bool:
@@ -187,7 +206,7 @@ def _other_cameras(root: Path, frames: list[PosedFrame]) -> list[PosedFrame]:
     return found
 
 
-def _world(root: Path, poses: Float[np.ndarray, "N 3 4"], bounds: Float[np.ndarray, "N 2"]) -> World:
+def world_of(root: Path, poses: Float[np.ndarray, "N 3 4"], bounds: Float[np.ndarray, "N 2"]) -> World:
     """Points of a COLMAP model, if there is one; otherwise units that contain what lies between the bounds."""
     if models := _models(root):
         # Several models have unrelated worlds: the poses come from the one with as many images.

@@ -38,11 +38,13 @@ class NamedTimes(NamedTuple):
         times: Of each name, from the first frame on.
         source: Where they come from.
         are_read: Whether the names hold them; if not, they count the names.
+        cameras: Number of the camera of each name, in the order of the names; all 0 if the names tell none.
     """
 
     times: list[float]
     source: TimeSource
     are_read: bool
+    cameras: list[int]
 
 
 class _Reading(NamedTuple):
@@ -68,7 +70,7 @@ def times_of_names(paths: Sequence[str]) -> NamedTimes:
         paths: Names of the images in sorted order, with or without folders and suffixes.
     """
     if not paths:
-        return NamedTimes([], TimeSource("no times"), False)
+        return NamedTimes([], TimeSource("no times"), False, [])
     stems = [_stem(path) for path in paths]
     stamps = (_Reading(found.nanoseconds, found.rests, True, found.midnight) for found in find_stamps(stems))
     numbers = [*_numbers(stems)]
@@ -129,7 +131,16 @@ def _times(paths: Sequence[str], reading: _Reading) -> NamedTimes:
     kind, unit = ("time stamps", " s") if reading.is_stamp else ("numbers", "")
     text = with_steps(f"times from the {kind} in the names", times, unit)
     shared = ", which cameras share" if len({*values}) < len(values) else ""
-    return NamedTimes(times, TimeSource(text + shared, problem), True)
+    return NamedTimes(times, TimeSource(text + shared, problem), True, _cameras(reading))
+
+
+def _cameras(reading: _Reading) -> list[int]:
+    """The camera of each name by what is left of it without the number, if these are of one rig."""
+    rests = ["#".join(rest) for rest in reading.rests]
+    if not share_times(reading.values, rests):
+        return [0] * len(rests)
+    number = {rest: k for k, rest in enumerate(dict.fromkeys(rests))}
+    return [number[rest] for rest in rests]
 
 
 def _after_jump(values: list[int], jump: tuple[int, int], before: str, is_stamp: bool) -> tuple[list[int], str]:
@@ -165,7 +176,7 @@ def _counted(paths: Sequence[str], reason: str) -> NamedTimes:
     """Times that count the names in their order, and why."""
     times = [float(k) for k in range(len(paths))]
     text = f"times from the sorted order of the names, because {reason}"
-    return NamedTimes(times, TimeSource(text, REMEDY if len(paths) > 1 else ""), False)
+    return NamedTimes(times, TimeSource(text, REMEDY if len(paths) > 1 else ""), False, [0] * len(times))
 
 
 def _missing_numbers(paths: Sequence[str], stems: Sequence[str], numbers: Sequence[_Reading]) -> str:

@@ -46,9 +46,9 @@ class NerfstudioLoader:
         entries = sorted(transforms.frames, key=lambda entry: natural_order(transforms.image_name(entry)))
         images = [transforms.image(entry) for entry in entries]
         names = plain_names([transforms.image_name(entry) for entry in entries])
-        times, source = _times(transforms, entries)
+        times, source, cameras = _times(transforms, entries)
         frames = []
-        for entry, image, name, time in zip(entries, images, names, times, strict=True):
+        for entry, image, name, time, camera in zip(entries, images, names, times, cameras, strict=True):
             mask, depth = transforms.file(entry, "mask_path"), transforms.file(entry, "depth_file_path")
             unit = _depth_unit(transforms)
             frames.append(
@@ -60,6 +60,7 @@ class NerfstudioLoader:
                     partial(read_resized_image, image),
                     None if mask is None else partial(read_resized_mask, mask, image=image),
                     None if depth is None else partial(read_metric_depth, depth, unit=unit, image=image),
+                    camera,
                 )
             )
         by_image = {image.resolve(): name for image, name in zip(images, names, strict=True)}
@@ -74,13 +75,17 @@ class NerfstudioLoader:
         return posed_capture(root, kept, val, world, options)
 
 
-def _times(transforms: Transforms, entries: Sequence[dict[str, Any]]) -> tuple[list[float], TimeSource]:
-    """Times of sorted frames, from the first on: their field ``time`` or ``timestamp``, else those of their names."""
+def _times(transforms: Transforms, entries: Sequence[dict[str, Any]]) -> tuple[list[float], TimeSource, list[int]]:
+    """Times of sorted frames, from the first on: their field ``time`` or ``timestamp``, else those of their names.
+
+    And the camera of each: its field ``camera_id``, else that of its name.
+    """
     names = [transforms.image_name(entry) for entry in entries]
-    times, source, are_read = times_of_names(names)
+    times, source, are_read, named = times_of_names(names)
+    cameras = transforms.cameras(entries) or named
     given = transforms.times(entries, "time", "timestamp")
     if given is None:
-        return times, source
+        return times, source, cameras
     field, stated = given
     first = min(stated)
     text = with_steps(f"times from the field {field} of {INDEX}", [float(time - first) for time in stated])
@@ -90,7 +95,7 @@ def _times(transforms: Transforms, entries: Sequence[dict[str, Any]]) -> tuple[l
     if reversed_ is not None:
         before, after = (visible(item[2]) for item in reversed_)
         problem = f"the numbers in the names have another order: {after} is earlier than {before}"
-    return [float(time - first) for time in stated], TimeSource(text, problem)
+    return [float(time - first) for time in stated], TimeSource(text, problem), cameras
 
 
 def _depth_unit(transforms: Transforms) -> float:

@@ -153,6 +153,25 @@ class Transforms:
             )
         return field, [self._time(frame, field) for frame in frames]
 
+    def cameras(self, frames: Sequence[dict[str, Any]]) -> list[int] | None:
+        """The field ``camera_id`` of each frame; None if no frame has it.
+
+        Raises:
+            ValueError: If only some frames have one, or it is not a whole number from 0 on.
+        """
+        if all(frame.get("camera_id") is None for frame in frames):
+            return None
+        ids: list[int] = []
+        for frame in frames:
+            i = frame.get("camera_id")
+            if isinstance(i, bool) or not isinstance(i, int) or i < 0:
+                raise ValueError(
+                    f"{self.path}: camera_id of {self._name(frame)} must be a whole number from 0 on, got "
+                    f"{reprlib.repr(i)}"
+                )
+            ids.append(i)
+        return ids
+
     def _time(self, frame: dict[str, Any], field: str) -> int | float:
         time = frame[field]
         if isinstance(time, bool) or not isinstance(time, int | float) or not -MAX_TIME <= time <= MAX_TIME:

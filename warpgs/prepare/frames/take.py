@@ -280,7 +280,7 @@ def _in_order_of_time(paths: Sequence[Path], notes: list[str]) -> tuple[list[Pat
         paths: Images in the order of their names.
         notes: Receives where the times come from, unless they count the images.
     """
-    named, source, are_read = times_of_names([path.name for path in paths])
+    named, source, are_read, _ = times_of_names([path.name for path in paths])
     scale = 1 if all(time.is_integer() for time in named) else 1000
     times = [round(scale * time) for time in named]
     if len({*times}) < len(times) or max(times) > MAX_TIME:
