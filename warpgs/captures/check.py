@@ -14,6 +14,7 @@ from warpgs.data.loaders import missing_capture
 from warpgs.data.writer import REPORT
 from warpgs.files import read_json
 
+from .agreement_check import check_agreement
 from .check_sample import Content, Sample, read_contents
 from .depth_check import check_depth
 from .findings import Finding, Report, UnfitCaptureError
@@ -61,13 +62,21 @@ def check_capture(
     if masks := _masks(capture, contents):
         findings += [*_judge(capture, masks, motions), *check_dynamic_depth([*masks.values()])]
     if is_readable:
-        findings += [
-            *check_points(sample.capture, sample.names),
-            *check_turning(sample.capture, sample.names),
-            *check_depth(sample.capture, sample.names),
-            *check_motion(motions, capture.conventions.masks),
-        ]
+        readable = {name for name, content in contents.items() if content.error is None}
+        findings += _compare(sample, motions, readable)
     return Report(root, [*findings, *_noted(root)])
+
+
+def _compare(sample: Sample, motions: list[Motion], readable: set[str]) -> list[Finding]:
+    """What frames say of points, cameras and depth; all training frames can be read, but maybe not all others."""
+    capture, names = sample.capture, sample.names
+    return [
+        *check_points(capture, names),
+        *check_turning(capture, names),
+        *check_depth(capture, names),
+        *check_motion(motions, capture.conventions.masks),
+        *check_agreement(capture, [cameras.of(readable) for cameras in sample.compared]),
+    ]
 
 
 def quick_findings(capture: Capture) -> list[Finding]:

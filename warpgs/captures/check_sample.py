@@ -11,6 +11,7 @@ from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import reduced_capture, reduced_frame
 from warpgs.data.sampling import evenly_spaced
 
+from .agreement_check import cameras_to_compare
 from .motion_check import pairs_to_compare
 
 COMPARED_SIDE = 1024
@@ -43,6 +44,7 @@ class Sample:
     Attributes:
         names: Some training frames, evenly spread over time.
         pairs: Pairs of training frames whose motion is compared.
+        compared: Pairs of cameras that are compared.
         capture: The capture with these frames only, scaled down, once ``look`` has read them.
     """
 
@@ -52,14 +54,16 @@ class Sample:
         largest = max(camera.width * camera.height for camera in capture.cameras.values())
         count = max(MIN_SAMPLES, min(MAX_SAMPLES, MAX_PIXELS // largest))
         self.names, self.pairs = evenly_spaced(names, count), pairs_to_compare(capture, count)
+        self.compared = cameras_to_compare(capture, count)
         self._frames: dict[str, Frame] = {}
-        self._wanted = {*self.names, *(name for pair in self.pairs for name in pair)}
+        across = [pair for cameras in self.compared for pair in cameras.frames]
+        self._wanted = {*self.names, *(name for pair in (*self.pairs, *across) for name in pair)}
         self.capture = replace(reduced_capture(self._whole, COMPARED_SIDE), read=self._read)
 
     @property
     def needed(self) -> list[str]:
         """All frames that are compared, in the order of the capture."""
-        return [name for name in self._whole.train if name in self._wanted]
+        return [name for name in (*self._whole.train, *self._whole.val) if name in self._wanted]
 
     def look(self, name: str) -> Content:
         """Reads a frame of the capture, and keeps it if it is compared.
