@@ -20,7 +20,7 @@ from warpgs.prepare.cameras import colmap, focal_guess, mapping, sfm
 from warpgs.prepare.cameras.features import Job
 from warpgs.prepare.cameras.focal_guess import calibrated
 from warpgs.prepare.cameras.mapping import _map_globally, reconstruct, refine
-from warpgs.prepare.cameras.matches import all_pairs, revisit_pairs, sequence_pairs
+from warpgs.prepare.cameras.matches import all_pairs, cross_pairs, revisit_pairs, sequence_pairs
 from warpgs.prepare.cameras.recovered import Cameras, NoCamerasError
 from warpgs.prepare.cameras.sfm import Settings, recover_cameras
 
@@ -110,6 +110,17 @@ def test_colmap_ends_when_the_process_that_started_it_ends(tmp_path):
 def test_frames_are_matched_with_the_next_ones_and_at_powers_of_two():
     assert sequence_pairs(3) == all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
     assert [b for a, b in sequence_pairs(100) if a == 0] == [*range(1, 11), 16, 32, 64]
+
+
+def test_frames_of_two_cameras_are_matched_at_near_times_and_every_eighth_with_all():
+    """The second camera starts half a frame later; a third one stands still, with one image."""
+    groups = [[*range(20)], [*range(20, 40)], [40]]
+    times = [*range(0, 2000, 100), *range(50, 2050, 100), 0]
+    pairs = cross_pairs(groups, times)
+    assert {(a, b) for a, b in pairs if a == 5 and b < 40} == {(5, 24), (5, 25)}
+    assert {(a, b) for a, b in pairs if a == 8 and b < 40} == {(8, 20), (8, 27), (8, 28), (8, 36)}
+    assert {(k, 40) for k in range(40)} <= {*pairs}
+    assert cross_pairs(groups[:1], times) == []
 
 
 def test_frames_that_see_the_same_points_much_later_are_matched():
