@@ -70,6 +70,7 @@ def opened(run, editing=None):
 
 def visited(source):
     controls = SimpleNamespace(**{name: Control() for name in ("crop", "opacity", "floaters", "undo", "save", "note")})
+    controls.corners = [Control((0.0, 0.0, 0.0)) for _ in range(2)]
     woken = []
     made = Cleanup(Scene(), controls, source, threading.Lock(), lambda: woken.append(1))
     made.controls, made.woken, made.browser, made.source = controls, woken, made._scene, source
@@ -110,17 +111,30 @@ def test_a_corner_that_is_dragged_moves_the_box_and_its_edges(cleanup):
     cleanup.controls.crop.value = True
     before = cleanup.edits.crop
     corner = tuple(np.array(before[3:]) - 0.3)
-    cleanup.browser.shown["/crop/high"].drag(corner)
+    cleanup.browser.shown["/crop/to"].drag(corner)
     assert cleanup.edits.crop == (*before[:3], *corner)
     edges = cleanup.browser.shown["/crop/edges"].reshape(-1, 3)
     assert edges.max(0) == pytest.approx(np.float32(corner))
     assert edges.min(0) == pytest.approx(np.float32(before[:3]))
 
 
+def test_a_corner_that_is_typed_moves_the_box(cleanup):
+    cleanup.controls.crop.value = True
+    before = cleanup.edits.crop
+    assert [corner.value for corner in cleanup.controls.corners] == [before[:3], before[3:]]
+    cleanup.controls.corners[0].value = (-0.5, -0.25, 0.0)
+    assert cleanup.edits.crop == (-0.5, -0.25, 0.0, *before[3:])
+    assert cleanup.browser.shown["/crop/from"].position == pytest.approx([-0.5, -0.25, 0.0])
+    assert cleanup.controls.corners[0].visible
+    cleanup.controls.undo.click()
+    assert cleanup.edits.crop == before
+
+
 def test_without_its_checkbox_the_box_is_gone(cleanup):
     whole = count(cleanup)
     cleanup.controls.crop.value = True
     cleanup.controls.crop.value = False
+    assert not cleanup.controls.corners[0].visible
     assert count(cleanup) == whole
     assert cleanup.browser.shown == {}
 
@@ -159,10 +173,10 @@ def test_edits_that_leave_nothing_are_undone_with_a_reason(cleanup):
 def test_positions_that_no_box_has_are_refused(cleanup, position):
     cleanup.controls.crop.value = True
     before = cleanup.edits
-    cleanup.browser.shown["/crop/high"].drag(position)
+    cleanup.browser.shown["/crop/to"].drag(position)
     assert cleanup.edits == before
     assert "--crop must be six numbers" in note(cleanup)
-    assert cleanup.browser.shown["/crop/high"].position == pytest.approx(before.crop[3:])
+    assert cleanup.browser.shown["/crop/to"].position == pytest.approx(before.crop[3:])
 
 
 def test_saved_edits_are_those_that_the_next_viewer_begins_with(cleanup, run):
@@ -175,7 +189,7 @@ def test_saved_edits_are_those_that_the_next_viewer_begins_with(cleanup, run):
     assert later.edits == cleanup.edits
     assert later.controls.crop.value is True
     assert count(later) == count(cleanup)
-    assert "/crop/low" in later.browser.shown
+    assert "/crop/from" in later.browser.shown
 
 
 def test_edits_that_leave_nothing_are_not_saved(cleanup, run):

@@ -1,7 +1,7 @@
 """Edits in the browser: a crop box with two corners to drag, opacity, floaters, undo; saved as the file of edits."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from warpgs.editing.options import Box, Edits
 from warpgs.errors import one_line
 from warpgs.runs.trained import TrainedScene
 
-from .cleanup_controls import OPACITIES, CleanupControls
+from .cleanup_controls import CORNERS, OPACITIES, CleanupControls
 from .panel import clamped, set_value
 from .path_controls import note_html
 from .source import Source
@@ -22,7 +22,6 @@ from .source import Source
 BOX = "/crop"
 """Path of the box in the scene of the browser."""
 
-CORNERS = ("low", "high")
 COLOR = (255, 160, 60)
 LINE_PIXELS = 1.5
 
@@ -31,6 +30,9 @@ HANDLE_SIZE = 0.15
 
 QUANTILES = (0.01, 0.99)
 """Of the Gaussians' centres, along each axis: where a new box begins and ends."""
+
+DIGITS = 3
+"""Decimals of the positions of its corners."""
 
 MAX_UNDO = 100
 """Maximum number of edits that can be undone."""
@@ -72,6 +74,8 @@ class Cleanup:
         self.edits = source.edits
         self._set_controls()
         controls.crop.on_update(lambda _: self._crop())
+        for corner in controls.corners:
+            corner.on_update(lambda _: self._type())
         controls.opacity.on_update(
             lambda _: self._change("min_opacity", clamped(controls.opacity.value, OPACITIES) or None)
         )
@@ -142,14 +146,24 @@ class Cleanup:
             self._change("crop", None)
         elif self.edits.crop is None and (scene := self._source.current()) is not None:
             means = scene.splats(0.5).means.cpu().numpy()
-            corners = np.nanquantile(means, QUANTILES, axis=0)
-            self._change("crop", tuple(corners.ravel().tolist()))
+            low, high = np.nanquantile(means, QUANTILES, axis=0).round(DIGITS)
+            self._change("crop", _box(low, high))
+
+    def _type(self) -> None:
+        """Makes the box between the corners that were typed."""
+        with self._lock:  # while both are set, one is not yet what it will be
+            if self.edits.crop is not None and not self._is_setting:
+                self._change("crop", _box(*(corner.value for corner in self._controls.corners)))
 
     def _set_controls(self) -> None:
         """Shows the edits in the controls, and the box in the scene."""
         controls, edits = self._controls, self.edits
         self._is_setting = True
         set_value(controls.crop, edits.crop is not None)
+        for k, corner in enumerate(controls.corners):
+            corner.visible = edits.crop is not None
+            if edits.crop is not None:
+                set_value(corner, edits.crop[3 * k : 3 * k + 3])
         set_value(controls.opacity, edits.min_opacity or 0.0)
         set_value(controls.floaters, edits.drop_floaters)
         self._is_setting = False
@@ -174,13 +188,8 @@ class Cleanup:
         """Arrows to drag a corner by."""
         handle = self._scene.add_transform_controls(f"{BOX}/{name}", size, disable_rotations=True, depth_test=False)
         handle.on_update(lambda _: self._draw())
-        handle.on_drag_end(lambda _: self._change("crop", self._dragged()))
+        handle.on_drag_end(lambda _: self._change("crop", _box(*(corner.position for corner in self._handles))))
         return handle
-
-    def _dragged(self) -> Box:
-        """The box between the corners as they are by now."""
-        x, y, z, u, v, w = (float(value) for handle in self._handles for value in handle.position)
-        return x, y, z, u, v, w
 
     def _draw(self) -> None:
         """Draws the edges of the box."""
@@ -191,6 +200,12 @@ class Cleanup:
 
     def _note(self, text: str) -> None:
         self._controls.note.content = note_html(text)
+
+
+def _box(low: Iterable[float], high: Iterable[float]) -> Box:
+    """The box between two corners that a browser sent."""
+    x, y, z, u, v, w = (float(value) for corner in (low, high) for value in corner)
+    return x, y, z, u, v, w
 
 
 def box_edges(low: Float32[np.ndarray, "3"], high: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, "12 2 3"]:

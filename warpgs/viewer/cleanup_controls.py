@@ -4,6 +4,9 @@ import viser
 
 from .path_controls import note_html
 
+CORNERS = ("from", "to")
+"""Names of the corners of the crop box."""
+
 OPACITIES = (0.0, 1.0)
 """Range of the slider of opacity."""
 
@@ -13,8 +16,11 @@ class CleanupControls:
 
     def __init__(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Clean up", expand_by_default=False):
-            hint = "Removes what is outside of a box at all times: drag the arrows of its corners"
+            hint = (
+                "Removes what is outside of a box at all times: drag the arrows of two corners, or type their positions"
+            )
             self.crop = gui.add_checkbox("crop box", False, hint=hint)
+            self.corners = [gui.add_vector3(name, (0.0, 0.0, 0.0), step=0.01, visible=False) for name in CORNERS]
             hint = "Removes what is fainter at all times"
             self.opacity = gui.add_slider("min opacity", *OPACITIES, 0.01, 0.0, hint=hint)
             hint = "Removes isolated Gaussians that the training cameras see little of"
