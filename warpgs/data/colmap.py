@@ -102,7 +102,7 @@ def lens_of_parameters(model: str, size: tuple[int, int], params: Sequence[float
 
 def parameters_of_lens(lens: Lens) -> tuple[str, list[float]]:
     """The camera model that represents a lens, and its parameters."""
-    if lens.model == "equirectangular":
+    if lens.is_panorama:
         return PANORAMA, [float(lens.width), float(lens.height)]
     name = "OPENCV_FISHEYE" if lens.model == "fisheye" else "OPENCV" if len(lens.coefficients) <= 4 else "FULL_OPENCV"
     parameters = [*lens.focal, *lens.center, *lens.coefficients, *[0.0] * 8]

@@ -115,7 +115,7 @@ class Lens:
     @property
     def centered_pinhole(self) -> "Lens":
         """A pinhole lens of these focal lengths, with its axis in the middle; raises ValueError of a panorama."""
-        if self.model == "equirectangular":
+        if self.is_panorama:
             raise ValueError("a panorama has no pinhole: omit --no-distortion, which is part of the preset paper")
         return Lens(self.width, self.height, self.focal, (self.width / 2, self.height / 2))
 
@@ -123,6 +123,11 @@ class Lens:
     def is_pinhole(self) -> bool:
         """Whether there is no distortion."""
         return self.model == "radial" and not self.coefficients
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether images are equirectangular."""
+        return self.model == "equirectangular"
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -157,7 +162,7 @@ class Lens:
 
     def file_depths(self, viewed: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
         """[P] depth of points in the camera as depth files have it: z, but of a panorama the distance."""
-        return np.linalg.norm(viewed, axis=1) if self.model == "equirectangular" else viewed[:, 2]
+        return np.linalg.norm(viewed, axis=1) if self.is_panorama else viewed[:, 2]
 
     def rays(self, u: Float[np.ndarray, "*N"], v: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N 3"]:
         """[..., 3] points in the camera at depth 1, as of ``Camera.depths``, that it sees at u, v; NaN at none."""
@@ -202,7 +207,7 @@ class Lens:
 def _distortion(lens: Lens) -> Distortion | None:
     if lens.is_pinhole:
         return None
-    if lens.model == "equirectangular":
+    if lens.is_panorama:
         return _panorama(lens)
     make = Distortion.fisheye if lens.model == "fisheye" else Distortion.radial
     return make(lens.coefficients, torch.tensor(lens.matrix, dtype=torch.float32), (lens.width, lens.height))

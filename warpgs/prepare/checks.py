@@ -41,6 +41,8 @@ def check_options(sources: Sequence[Path], root: Path, options: Options) -> None
         raise ValueError(
             f"--lens {options.lens} needs a camera that moves: with --camera {options.camera}, use --intrinsics"
         )
+    if options.has_panoramas:
+        _check_panoramas(sources, options)
     check_holdout(options.holdout)
     if options.masks not in MASKERS and not Path(options.masks).is_dir():
         close = suggestion(options.masks, MASKERS) or similar_path(Path(options.masks))
@@ -56,6 +58,15 @@ def check_options(sources: Sequence[Path], root: Path, options: Options) -> None
         )
     _check_networks(options)
     _check_paths(sources, root, options)
+
+
+def _check_panoramas(sources: Sequence[Path], options: Options) -> None:
+    if len(sources) > 1:
+        raise ValueError("--lens EQUIRECTANGULAR is for one video: several cameras must be perspective or fisheye ones")
+    if options.focal is not None:
+        raise ValueError("--lens EQUIRECTANGULAR says all about the lens: omit --focal")
+    if options.depth_method == "anything":
+        raise ValueError("--depth anything knows no panoramas: use --depth flow or none")
 
 
 def _check_several(sources: Sequence[Path], options: Options) -> None:
@@ -110,6 +121,11 @@ def check_frames(videos: Sequence[Frames], options: Options) -> None:
     ):
         raise ValueError("--focal and --intrinsics are of all videos, which have several sizes: omit them")
     for video in videos:
+        if options.has_panoramas and abs(video.width - 2 * video.height) > 2:
+            raise ValueError(
+                f"--lens EQUIRECTANGULAR needs frames twice as wide as high, those of {video.source} are "
+                f"{video.width}×{video.height}: export the whole sphere from the camera's program"
+            )
         count, whose = len(video.taken), f" of {video.source}" if len(videos) > 1 else ""
         if MASKERS.get(options.masks) is not None and count < MIN_FOR_MOTION:
             raise ValueError(

@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-LensModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"]
+LensModel = Literal[
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
+]
 """COLMAP's lens models that a capture's cameras can represent."""
 
 CameraMotion = Literal["moving", "turning", "still"]
@@ -39,7 +41,7 @@ class Options:
 
     selection: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     lens: LensModel = "SIMPLE_RADIAL"
-    """COLMAP's lens model."""
+    """COLMAP's lens model; EQUIRECTANGULAR for 360° videos."""
     focal: float | None = None
     """Known focal length [px of the source's frames]; found by default."""
     intrinsics: Path | None = None
@@ -72,6 +74,11 @@ class Options:
             return None if self.offset is None else [float(part) for part in self.offset.split(",")]
         except ValueError:
             raise ValueError(f"--offset must be numbers of seconds, separated by commas, got {self.offset}") from None
+
+    @property
+    def has_panoramas(self) -> bool:
+        """Whether frames are of 360°."""
+        return self.lens == "EQUIRECTANGULAR"
 
     @property
     def depth_method(self) -> str:

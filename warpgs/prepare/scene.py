@@ -130,9 +130,8 @@ def are_static(points: Float[np.ndarray, "P 3"], cameras: Iterable[tuple[Cameras
         lens = camera.lens
         for pose, mask in zip(camera.poses, dynamic, strict=True):
             in_camera = points @ pose[:, :3].T + pose[:, 3]
-            front = in_camera[:, 2] > 0
-            depth = np.where(front, in_camera[:, 2], 1.0)
-            position = lens.image(in_camera[:, 0] / depth, in_camera[:, 1] / depth)
+            front = lens.file_depths(in_camera) > 0
+            position = lens.project(np.where(front[:, None], in_camera, (0.0, 0.0, 1.0))).T
             column, row = np.floor(position).clip(-1, 1e6).astype(int)
             visible = front & (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
             views += visible

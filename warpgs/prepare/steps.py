@@ -12,7 +12,8 @@ import numpy as np
 from warpgs.data.lens import Lens
 
 from .cameras.intrinsics import read_intrinsics
-from .cameras.posed_frames import load_posed_frames
+from .cameras.panorama import views_of
+from .cameras.posed_frames import PosedFrames, load_posed_frames
 from .cameras.recovered import (
     Cameras,
     NoCamerasError,
@@ -58,6 +59,10 @@ MIN_KEPT = 0.8
 STILL_FOCAL = 1.0
 """Focal length over the longer side of a camera on a tripod whose focal length is unknown: 53° across."""
 
+MAYBE_PANORAMAS = (
+    "frames are twice as wide as high, as panoramas are, but they are taken as those of a lens: if this is a 360° "
+    "video, give --lens EQUIRECTANGULAR"
+)
 
 Names = list[list[str]]
 """Names of the frames of each camera."""
@@ -94,6 +99,8 @@ def _take(sources: Sequence[Path], folder: Path, options: Options, journal: Jour
         video = take_frames(sources[0], folder, options.selection, journal.quiet, journal.notes)
         if options.camera == "still":
             require_still(folder, video.names)
+        if video.width == 2 * video.height and not options.has_panoramas:
+            journal.notes.append(MAYBE_PANORAMAS)
         return [video], f"{len(video.taken)} of {video.width}×{video.height}"
     clock, starts = common_clock(sources, options.offsets, journal.quiet)
     videos = take_videos(sources, folder, options.selection, clock, journal.quiet, journal.notes)
@@ -194,15 +201,17 @@ class Steps:
     @property
     def _known_lens(self) -> Lens | None:
         """Known lens of the frames."""
+        width, height, factor = self.videos[0].width, self.videos[0].height, self.videos[0].factor
+        if self.options.has_panoramas:
+            return Lens.panorama((width, height))
         if self.options.intrinsics is None:
             return None
-        width, height, factor = self.videos[0].width, self.videos[0].height, self.videos[0].factor
         source = round(width / factor), round(height / factor)
         return read_intrinsics(self.options.intrinsics, source).resized(width, height)
 
     def recover_background(self, name: str) -> list[Cameras]:
         """The cameras of all frames, without features that do not move with the background if that suffices."""
-        if self.options.camera != "moving" or not self._moving:
+        if self.options.camera != "moving" or self.options.has_panoramas or not self._moving:
             return self.recover(name, self.names, thorough=False)
         background = self.find_background(BACKGROUND)
         try:
@@ -294,9 +303,9 @@ class Steps:
         off = Masks.load(background).read_dynamic(camera) if has_background else None
         found = doubts_of_masks(masks.read_dynamic(camera), masks.estimated, off)
         if not video.is_still:
-            frames = load_posed_frames(video.folder, camera, WORKING_SIDE).halved
+            frames = _compared(video.folder, camera).halved
             found += doubts_of_motion(frames, self.journal.quiet)
-        is_known = self.options.camera == "still" or self.options.focal or self.options.intrinsics
+        is_known = self.options.camera == "still" or self._focal or self._known_lens
         return found if is_known else [*found, *doubts_of_lens(camera)]
 
     def add_depth(self, name: str, cameras: list[Cameras]) -> None:
@@ -353,6 +362,13 @@ def _shots(video: Frames, names: list[str]) -> Shots:
         return Shots(video.source, [video.background], [video.taken[0].time])
     times = {frame.name: frame.time for frame in video.taken}
     return Shots(video.source, names, [times[name] for name in names])
+
+
+def _compared(folder: Path, camera: Cameras) -> PosedFrames:
+    """The frames of a camera whose optical flow is compared with it, of panoramas the view ahead."""
+    if camera.lens.is_panorama:
+        return next(views_of(folder, camera, WORKING_SIDE // 2))
+    return load_posed_frames(folder, camera, WORKING_SIDE)
 
 
 def _save(cameras: Sequence[Cameras], path: Path, names: Names) -> str:

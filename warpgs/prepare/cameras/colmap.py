@@ -75,6 +75,7 @@ def _check_parallax(job: Job, database: Path) -> None:
     pairs, focal = [*matches.values()], job.focal
     if job.params is not None:
         lens = lens_of_parameters(job.lens, size, job.params)
+        pairs = [_ahead(*pair, lens) for pair in pairs] if job.sees_all else pairs
         pairs, focal = [(_undistorted(a, lens), _undistorted(b, lens)) for a, b in pairs], lens.focal[0]
     turning = find_turning(pairs, size, focal)
     if turning is None:
@@ -93,6 +94,14 @@ def _check_parallax(job: Job, database: Path) -> None:
             + (known if job.finds_focal else "")
             + "; masks alone are found with --camera turning"
         )
+
+
+def _ahead(
+    first: Float[np.ndarray, "M 2"], second: Float[np.ndarray, "M 2"], lens: Lens
+) -> tuple[Float[np.ndarray, "A 2"], Float[np.ndarray, "A 2"]]:
+    """The matches that both frames see at most 60° from the axis, where a pinhole could, too."""
+    kept = np.minimum(*(lens.unit_rays(positions)[:, 2] for positions in (first, second))) > 0.5
+    return first[kept], second[kept]
 
 
 def _undistorted(positions: Float[np.ndarray, "M 2"], lens: Lens) -> Float[np.ndarray, "M 2"]:

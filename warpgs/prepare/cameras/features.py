@@ -9,6 +9,8 @@ from typing import Any
 import cv2  # noqa: F401  before pycolmap, see ``colmap``
 import pycolmap
 
+from warpgs.data.colmap import PANORAMA
+
 from .matches import Pair, cross_pairs, has_features, keep_static, sequence_pairs
 from .recovered import NoCamerasError
 
@@ -90,6 +92,11 @@ class Job:
     def database(self) -> Path:
         """Database of all features and matches."""
         return Path(self.work) / ("weak.db" if self.weak_features else "features.db")
+
+    @property
+    def sees_all(self) -> bool:
+        """Whether the frames are panoramas."""
+        return self.lens == PANORAMA
 
     @property
     def finds_focal(self) -> bool:

@@ -11,6 +11,8 @@ import cv2  # noqa: F401  before pycolmap, see ``colmap``
 import numpy as np
 import pycolmap
 
+from warpgs.data.colmap import PANORAMA
+
 from .features import Job, Report, match, static_database
 from .focal_guess import calibrated, confirms, focal_of, is_plausible, read_focals
 from .matches import all_pairs, revisit_pairs
@@ -177,8 +179,10 @@ def _longest_sequence(log_depths: list[float]) -> list[int]:
 
 
 def _median_depth(model: Any, image: Any) -> float:
-    """Median depth of the points that a frame sees; NaN if most are behind it."""
+    """Median depth of the points that a frame sees, of a panorama their distance; NaN if most are behind it."""
     seen = [model.points3D[point.point3D_id].xyz for point in image.points2D if point.has_point3D()]
+    if image.camera.model.name == PANORAMA:
+        return float(np.median(np.linalg.norm(np.array(seen) - image.projection_center(), axis=1)))
     pose = image.cam_from_world().matrix()
     depth = float(np.median(np.array(seen) @ pose[2, :3] + pose[2, 3]))
     return depth if depth > 0.0 else math.nan
@@ -204,7 +208,7 @@ def refine(job: Job, model: Any, report: Report) -> Any:
     A plausible focal length that adjustment makes implausible is held instead.
     """
     if job.thorough:
-        match(job, revisit_pairs(model, job.files, job.groups), report)
+        match(job, revisit_pairs(model, job.files, job.groups, job.sees_all), report)
     report("refinement", 0, 1)
     refined = _adjusted(job, copy.deepcopy(model))
     if job.guesses_focal and len(job.groups) == 1 and is_plausible(model) and not is_plausible(refined):

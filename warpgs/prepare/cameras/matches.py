@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float
 from warpgs.data.images import decode
 from warpgs.data.turning import Matches
 
+from .recovered import camera_centers
+
 OVERLAP = 10
 """Number of next frames that each frame is matched with, in addition to those at powers of two."""
 
@@ -57,25 +59,30 @@ def cross_pairs(groups: Sequence[Sequence[int]], times: Sequence[int]) -> list[P
     return sorted(pairs)
 
 
-def revisit_pairs(model: Any, names: list[str], groups: Sequence[Sequence[int]] = ()) -> list[Pair]:
+def revisit_pairs(
+    model: Any, names: list[str], groups: Sequence[Sequence[int]] = (), sees_all: bool = False
+) -> list[Pair]:
     """Pairs of frames far apart in time, or of two cameras, that see the same points, according to a reconstruction.
 
     Args:
         model: COLMAP's reconstruction.
         names: Names of the images.
         groups: Indices of the images of each camera, in temporal order; those of one camera if empty.
+        sees_all: Whether images are panoramas, which see the more alike, the nearer they are to each other.
     """
     order = {k: place + APART * camera for camera, group in enumerate(groups) for place, k in enumerate(group)}
     images = {image.name: image for image in model.images.values() if image.has_pose}
     points = {key: point.xyz for key, point in model.points3D.items()}
     frames = [(k, images[name]) for k, name in enumerate(names) if name in images]
     poses = np.array([image.cam_from_world().matrix() for _, image in frames]).reshape(-1, 3, 4)
-    limits = np.array([_half_size(image.camera) for _, image in frames]).reshape(-1, 2)
+    limits = np.array([(1.0, 1.0) if sees_all else _half_size(i.camera) for _, i in frames]).reshape(-1, 2)
     shared = np.zeros((len(frames), len(frames)))
     for row, (_, image) in enumerate(frames):
         seen = [points[p.point3D_id] for p in image.points2D if p.has_point3D()]
         if seen:
-            shared[row] = _visible(np.array(seen), poses, limits).mean(1)
+            shared[row] = (
+                _nearness(np.array(seen), poses, row) if sees_all else _visible(np.array(seen), poses, limits).mean(1)
+            )
     shared = np.minimum(shared, shared.T)
     pairs = set()
     for row, (index, _) in enumerate(frames):
@@ -89,6 +96,15 @@ def revisit_pairs(model: Any, names: list[str], groups: Sequence[Sequence[int]] 
             found = order.get(frames[best][0], frames[best][0])
             score[[abs(order.get(other, other) - found) < OVERLAP // 2 for other, _ in frames]] = 0.0
     return sorted(pairs)
+
+
+def _nearness(
+    points: Float[np.ndarray, "P 3"], poses: Float[np.ndarray, "F 3 4"], frame: int
+) -> Float[np.ndarray, " F"]:
+    """[F] how near cameras are to that of a frame: 1 at its place, 0.5 as far away as half of its points."""
+    centers = camera_centers(poses)
+    depth = np.median(np.linalg.norm(points - centers[frame], axis=1))
+    return depth / (depth + np.linalg.norm(centers - centers[frame], axis=1))
 
 
 def _half_size(camera: Any) -> Float[np.ndarray, "2"]:

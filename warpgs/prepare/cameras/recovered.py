@@ -109,7 +109,7 @@ class Cameras:
             names=np.array(self.names),
             lens=np.array([lens.width, lens.height, *lens.focal, *lens.center]),
             coefficients=np.array(lens.coefficients),
-            is_fisheye=np.array(lens.model == "fisheye"),
+            model=np.array(lens.model),
             poses=self.poses,
             points=self.points,
             quality=np.array([self.error, self.angle]),
@@ -144,7 +144,7 @@ class Cameras:
             (fx, fy),
             (cx, cy),
             tuple(z["coefficients"].tolist()),
-            "fisheye" if z["is_fisheye"] else "radial",
+            str(z["model"]),  # type: ignore[arg-type]
         )
         error, angle = z["quality"].tolist()
         flags = map(bool, z["flags"])

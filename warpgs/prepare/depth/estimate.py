@@ -12,6 +12,7 @@ from warpgs.captures.findings import few_of
 from warpgs.data.images import read_mask
 from warpgs.data.writer import write_depth
 
+from ..cameras.panorama import TURNS, cut, joined, views_of
 from ..cameras.posed_frames import PosedFrames, load_posed_frames
 from ..cameras.recovered import Cameras
 from ..cameras.sphere import points_around
@@ -69,9 +70,7 @@ def add_depth(
     known: dict[str, float] = {}
     sheets, folder, chosen = [], find_weights(method.network, weights), method.applies_to(cameras)
     for camera in chosen:
-        frames = load_posed_frames(root / "rgb/1x", camera, MAX_SIDE, max_factor=1.0)
-        dynamic = _dynamic_masks(root, camera, (frames.lens.width, frames.lens.height))
-        planes = method.estimate(frames, dynamic, folder, quiet)
+        planes = _estimated(root, camera, method, folder, quiet)
         for name, plane in zip(camera.names, planes, strict=True):
             write_depth(root, name, as_half(plane))
             known[name] = float(np.isfinite(plane).mean())
@@ -86,6 +85,22 @@ def add_depth(
     unknown = [name for name, fraction in known.items() if fraction == 0.0]
     notes = [f"depth is unknown everywhere in {few_of(unknown)}"] if unknown else []
     return f"known on {np.mean([*known.values()]):.0%} of the pixels{whose}", notes
+
+
+def _estimated(root: Path, camera: Cameras, method: DepthMethod, folder: Path | None, quiet: bool) -> Planes:
+    """Inverse depth of a camera's frames, of panoramas the inverse distance from six views."""
+    images = root / "rgb/1x"
+    if not camera.lens.is_panorama:
+        frames = load_posed_frames(images, camera, MAX_SIDE, max_factor=1.0)
+        dynamic = _dynamic_masks(root, camera, (frames.lens.width, frames.lens.height))
+        return method.estimate(frames, dynamic, folder, quiet)
+    size, views = (camera.lens.width, camera.lens.height), []
+    for turn, frames in zip(TURNS, views_of(images, camera, MAX_SIDE // 2), strict=True):
+        masks = _dynamic_masks(root, camera, size)
+        dynamic = (cut(mask.astype(np.float32), turn, frames.lens) > 0.0 for mask in masks)
+        slant = np.sqrt(np.square(frames.rays).sum(-1) + 1.0)
+        views.append([plane / slant for plane in method.estimate(frames, dynamic, folder, quiet)])
+    return joined(views, size, cv2.INTER_NEAREST)
 
 
 def depth_files(root: Path, names: Sequence[str]) -> list[Path]:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from ..cameras.panorama import joined, views_of
 from ..cameras.posed_frames import PosedFrames, load_posed_frames
 from ..cameras.recovered import Cameras
 from ..weights import Network, find_weights
@@ -48,6 +49,10 @@ def find_masks(
     """
     folder = find_weights(masker.network, weights)
     side = WORKING_SIDE // 2 if half_size else WORKING_SIDE
-    masks = masker.find(load_posed_frames(images, cameras, side), folder, quiet)
     size = cameras.lens.width, cameras.lens.height
+    if cameras.lens.is_panorama:
+        views = [masker.find(view, folder, quiet) for view in views_of(images, cameras, side // 2)]
+        planes = [[mask.astype(np.float32) for mask in view] for view in views]
+        return [plane > 0.5 for plane in joined(planes, size, cv2.INTER_CUBIC)]
+    masks = masker.find(load_posed_frames(images, cameras, side), folder, quiet)
     return [cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_CUBIC) > 0.5 for mask in masks]
