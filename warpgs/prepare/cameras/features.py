@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2  # noqa: F401  before pycolmap, see ``colmap``
+import numpy as np
 import pycolmap
 
 from warpgs.data.colmap import PANORAMA
+from warpgs.files import write_png
 
+from ..frames.circle import circle_of
 from .matches import Pair, cross_pairs, has_features, keep_static, sequence_pairs
 from .recovered import NoCamerasError
 
@@ -139,6 +142,9 @@ def _extract(job: Job, camera: int, files: list[str], extraction: Any, report: R
     reading.camera_model = job.lens
     if (params := _starting_parameters(job, files[0])) is not None:
         reading.camera_params = ",".join(map(str, params))
+    if job.lens == FISHEYE and (circle := circle_of(Path(job.folder), [Path(file).stem for file in files])) is not None:
+        reading.camera_mask_path = job.database.with_suffix(f".circle{camera}.png")
+        write_png(reading.camera_mask_path, circle.astype(np.uint8) * 255)
     for start in range(0, len(files), CHUNK):
         report("features", job.files.index(files[start]), len(job.files))
         chunk = files[start : start + CHUNK]

@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 
 from warpgs.data.lens import Lens
 
+from ..frames.circle import circle_in, spread
 from ..frames.flow import Flows
 from ..frames.images import read_images, resize_to_side
 from .recovered import Cameras, are_apart, camera_centers
@@ -31,7 +32,8 @@ class PosedFrames:
     """Images of one lens with their poses.
 
     Attributes:
-        images: [H, W, 3] of every frame.
+        images: [H, W, 3] of every frame; around the circle of a fisheye lens with the colours of its rim.
+        shown: [H, W] true inside that circle; None if images have none.
         lens: The lens.
         poses: [F, 3, 4] world to camera.
         points: [P, 3] some points of the scene.
@@ -59,7 +61,9 @@ class PosedFrames:
             points: [P, 3] some points of the scene; a few hundred are used.
             focal: Focal length in the pixels that errors are counted in; that of the lens if None.
         """
-        self.images, self.lens, self.poses = images, lens, poses
+        self.shown = circle_in(images) if lens.model == "fisheye" else None
+        self.images = images if self.shown is None else spread(images, self.shown)
+        self.lens, self.poses = lens, poses
         self.points = points[:: max(1, len(points) // 400)]
         self.focal = lens.focal[0] if focal is None else focal
         self.rays = pixel_rays(lens)
@@ -152,6 +156,8 @@ class PosedFrames:
         found = []
         for other in self.neighbours[frame]:
             x, y, visible = flows.track(frame, other)
+            if self.shown is not None:
+                visible &= self.shown & (cv2.remap(self.shown.astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0)
             rotation, translation = self.relative(frame, other)
             position = cv2.remap(self.rays, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             position = np.ascontiguousarray(position.transpose(2, 0, 1))

@@ -93,7 +93,8 @@ def _estimated(root: Path, camera: Cameras, method: DepthMethod, folder: Path | 
     if not camera.lens.is_panorama:
         frames = load_posed_frames(images, camera, MAX_SIDE, max_factor=1.0)
         dynamic = _dynamic_masks(root, camera, (frames.lens.width, frames.lens.height))
-        return method.estimate(frames, dynamic, folder, quiet)
+        planes = method.estimate(frames, dynamic, folder, quiet)
+        return planes if frames.shown is None else [np.where(frames.shown, plane, np.nan) for plane in planes]
     size, views = (camera.lens.width, camera.lens.height), []
     for turn, frames in zip(TURNS, views_of(images, camera, MAX_SIDE // 2), strict=True):
         masks = _dynamic_masks(root, camera, size)

@@ -54,5 +54,8 @@ def find_masks(
         views = [masker.find(view, folder, quiet) for view in views_of(images, cameras, side // 2)]
         planes = [[mask.astype(np.float32) for mask in view] for view in views]
         return [plane > 0.5 for plane in joined(planes, size, cv2.INTER_CUBIC)]
-    masks = masker.find(load_posed_frames(images, cameras, side), folder, quiet)
+    frames = load_posed_frames(images, cameras, side)
+    masks = masker.find(frames, folder, quiet)
+    if frames.shown is not None:
+        masks = [mask & frames.shown for mask in masks]
     return [cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_CUBIC) > 0.5 for mask in masks]
