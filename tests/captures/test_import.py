@@ -320,3 +320,41 @@ def test_frames_stay_as_recorded_with_their_lens_and_depth(tmp_path, fields):
     assert torch.allclose(a.camera.distortion.coefficients, b.camera.distortion.coefficients)
     known = a.inverse_depth.isfinite()
     assert torch.allclose(a.inverse_depth[known], b.inverse_depth[known], rtol=2e-3)
+
+
+def rig_of(tmp_path):
+    """A capture of three cameras with three frames each, of which the first is for evaluation."""
+    root = tmp_path / "source"
+    for i in range(3):
+        for k in range(3):
+            captures.write_png(root / f"cam{i}/{k}.png", layouts.image(3 * i + k))
+    layouts.write_llff(tmp_path / "poses", motion=False)
+    rows = np.load(tmp_path / "poses/poses_bounds.npy")[:3]
+    captures.write_array(root / "poses_bounds.npy", rows)
+    return root
+
+
+@pytest.mark.parametrize(
+    ("options", "val"),
+    [
+        ({}, ["cam00_00000", "cam00_00001", "cam00_00002"]),
+        ({"holdout_camera": (2,)}, ["cam02_00000", "cam02_00001", "cam02_00002"]),
+        ({"holdout_camera": (0, 1), "holdout": 3}, [*(f"cam0{i // 3}_0000{i % 3}" for i in range(6)), "cam02_00001"]),
+        ({"holdout": 3}, ["cam00_00001", "cam01_00001", "cam02_00001"]),
+    ],
+)  # fmt: skip
+def test_cameras_are_held_out(tmp_path, options, val):
+    import_capture(rig_of(tmp_path), tmp_path / "copy", **options)
+    capture = load_capture(tmp_path / "copy")
+    assert sorted(capture.val) == val
+    assert len(capture.train) + len(capture.val) == 9
+
+
+@pytest.mark.parametrize(
+    ("ids", "message"),
+    [((7,), "--holdout-camera 7: there are only the cameras 0, 1, 2"), ((0, 1, 2), "leaves no camera to train on")],
+)
+def test_a_camera_that_cannot_be_held_out_is_refused(tmp_path, ids, message):
+    with pytest.raises(ValueError, match=message):
+        import_capture(rig_of(tmp_path), tmp_path / "copy", holdout_camera=ids)
+    assert not (tmp_path / "copy").exists()

@@ -13,7 +13,7 @@ import rich
 import torch
 
 from warpgs.captures.opening import load_capture
-from warpgs.config.builtin import parse_builtin
+from warpgs.config.builtin import Builtin, parse_builtin
 from warpgs.synthetic import studio
 from warpgs.synthetic.degraded_depth import DegradedDepth
 from warpgs.synthetic.folder import builtin_folder
@@ -126,10 +126,10 @@ def test_a_name_opens_the_capture_and_it_is_made_once(tmp_path, monkeypatch, cap
 
 
 def test_a_name_tells_depth_and_number_of_frames():
-    assert parse_builtin("builtin:studio") == ("studio", "exact", 160)
-    assert parse_builtin("builtin:studio?frames=12") == ("studio", "exact", 12)
-    assert parse_builtin("builtin:studio?frames=12&depth=none") == ("studio", "none", 12)
-    assert parse_builtin("builtin:room") == ("room", "exact", 160)
+    assert parse_builtin("builtin:studio") == Builtin("studio", "exact", 160)
+    assert parse_builtin("builtin:studio?frames=12") == Builtin("studio", "exact", 12)
+    assert parse_builtin("builtin:studio?frames=12&depth=none") == Builtin("studio", "none", 12)
+    assert parse_builtin("builtin:room") == Builtin("room")
 
 
 @pytest.mark.parametrize("name", ["studio?frames", "studio?frames=1", "studio?frames=161", "studio?frames=-3"])

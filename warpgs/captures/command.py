@@ -32,5 +32,6 @@ def run_import(options: Import) -> None:
         options.dataset,
         factor=options.factor,
         holdout=options.holdout,
+        holdout_camera=options.holdout_camera,
         log=None if options.quiet else show,
     )

@@ -1,7 +1,8 @@
 """Copies a capture of any layout into the layout of warpgs, in scene units."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ def import_capture(
     *,
     factor: int | None = None,
     holdout: int | None = None,
+    holdout_camera: Collection[int] = (),
     log: Callable[[str], None] | None = None,
 ) -> None:
     """Writes a copy of a capture in the layout of warpgs (docs/capture-format.md).
@@ -39,7 +41,7 @@ def import_capture(
         target: Folder to write; it must not exist or be empty.
         dataset: Layout of the source, a key of ``LOADERS``; recognized from its files if None.
         factor: Downscaling factor of the images; that of the layout if None.
-        holdout: Every N-th frame is for evaluation, 0 for none; the split of the source if None.
+        holdout, holdout_camera: See ``Import``; None and none keep the split of the source.
         log: Receives lines for the user; None shows nothing, the progress bar included.
 
     Raises:
@@ -49,9 +51,9 @@ def import_capture(
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{target} is not an empty folder: choose a new one for the capture")
     capture, renamed = _with_plain_ids(load_capture(source, dataset, factor=factor, cache_frames=2))
-    of_cameras = capture.by_camera((*capture.train, *capture.val)).values()
-    names = [name for frames in of_cameras for name in frames]  # videos are decoded in the order of their frames
-    val = list(capture.val) if holdout is None else writer.held_out(names, holdout)
+    by_camera = capture.by_camera((*capture.train, *capture.val))
+    names = [*chain(*by_camera.values())]  # videos are decoded in order
+    val = _held_out(capture, by_camera, holdout, holdout_camera)
     with complete_or_absent(target) as folder:
         counts = _write_frames(folder, capture, names, quiet=log is None)
         _write_index(folder, capture, names, val)
@@ -62,6 +64,16 @@ def import_capture(
         )
         _log_remarks(capture, renamed, log)
         log(f"{target} is finished: next run {command('check', target)}")
+
+
+def _held_out(
+    capture: Capture, by_camera: Mapping[int, Sequence[str]], holdout: int | None, ids: Collection[int]
+) -> list[str]:
+    """The frames to evaluate on; the last two arguments are those of ``import_capture``."""
+    if holdout is None and not ids:
+        return list(capture.val)
+    others = [name for i, frames in by_camera.items() if i not in ids for name in frames]
+    return writer.held_out_cameras(by_camera, ids) + writer.held_out(others, holdout or 0)
 
 
 def _with_plain_ids(capture: Capture) -> tuple[Capture, list[tuple[str, str]]]:

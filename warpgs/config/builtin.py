@@ -11,7 +11,17 @@ DEPTHS = ("exact", "network", "none")
 MIN_FRAMES, MAX_FRAMES = 2, 160
 """Number of training frames of ``builtin:studio?frames=N``; as many are the default."""
 
-NAMES = ("builtin:room", "builtin:balls", "builtin:studio", *(f"builtin:studio?depth={depth}" for depth in DEPTHS))
+RIG_FRAMES, MAX_CAMERAS, MAX_OFFSET = 60, 5, 1.0
+"""Frames of each camera of ``builtin:rig?frames=N``, training cameras of ``builtin:rig?cameras=N``, and maximum of
+``builtin:rig?offset=S``, by which the clocks of its cameras differ at most [s]; the first two are the defaults."""
+
+QUERIES = {"studio": ("depth", "frames"), "rig": ("frames", "cameras", "offset")}
+"""What may follow the names of built-in captures."""
+
+NAMES = (
+    *("builtin:room", "builtin:balls", "builtin:rig", "builtin:studio"),
+    *(f"builtin:studio?depth={depth}" for depth in DEPTHS),
+)
 
 
 def is_builtin(data: Path | str) -> bool:
@@ -23,14 +33,18 @@ class Builtin(NamedTuple):
     """A built-in capture.
 
     Attributes:
-        name: "room", "balls" or "studio".
+        name: "room", "balls", "studio" or "rig".
         depth: Depth of the studio.
-        num_frames: Number of training frames of the studio.
+        num_frames: Number of training frames of the studio, and frames of each camera of the rig.
+        num_cameras: Number of training cameras of the rig.
+        offset: By how much the clocks of its cameras differ at most [s].
     """
 
     name: str
     depth: Literal["exact", "network", "none"] = "exact"
     num_frames: int = MAX_FRAMES
+    num_cameras: int = MAX_CAMERAS
+    offset: float = 0.0
 
 
 def parse_builtin(data: Path | str) -> Builtin:
@@ -42,15 +56,35 @@ def parse_builtin(data: Path | str) -> Builtin:
     given = str(data).removeprefix(PREFIX)
     name, mark, query = given.partition("?")
     options = dict(part.partition("=")[::2] for part in query.split("&")) if mark else {}
-    depth, frames = options.pop("depth", "exact"), options.pop("frames", str(MAX_FRAMES))
-    is_known = f"{PREFIX}{name}" in NAMES and not options and (name == "studio" or not mark)
-    if not is_known or depth not in DEPTHS:
+    is_known = f"{PREFIX}{name}" in NAMES and {*options} <= {*QUERIES.get(name, ())} and bool(options) == bool(mark)
+    if not is_known or options.get("depth", "exact") not in DEPTHS:
         # Without the prefix, which would make all names similar.
         close = suggestion(given, [name.removeprefix(PREFIX) for name in NAMES], f"{PREFIX}{{}}".format)
         raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}{close}")
-    if not frames.isdecimal() or not MIN_FRAMES <= int(frames) <= MAX_FRAMES:
-        raise ValueError(f"{data}: expected {MIN_FRAMES} to {MAX_FRAMES} frames, got {frames}")
-    return Builtin(name, cast(Any, depth), int(frames))
+    most = RIG_FRAMES if name == "rig" else MAX_FRAMES
+    return Builtin(
+        name,
+        cast(Any, options.get("depth", "exact")),
+        _whole(data, options.get("frames", str(most)), MIN_FRAMES, most, "frames"),
+        _whole(data, options.get("cameras", str(MAX_CAMERAS)), 1, MAX_CAMERAS, "cameras"),
+        _seconds(data, options.get("offset", "0")),
+    )
+
+
+def _whole(data: Path | str, text: str, low: int, high: int, unit: str) -> int:
+    if not text.isdecimal() or not low <= int(text) <= high:
+        raise ValueError(f"{data}: expected {low} to {high} {unit}, got {text}")
+    return int(text)
+
+
+def _seconds(data: Path | str, text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not 0.0 <= seconds <= MAX_OFFSET:
+        raise ValueError(f"{data}: expected an offset from 0 to {MAX_OFFSET:g} seconds, got {text}")
+    return seconds
 
 
 def require_factor(data: Path | str, factor: int | None) -> None:

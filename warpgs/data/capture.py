@@ -313,17 +313,21 @@ class Capture:
         They are those of the camera with the most times, and of others before and after it: cameras that film at the
         same time, with offsets in between, do not determine faster motion.
         """
-        of_cameras = [{self.cameras[n].time for n in frames} for frames in self.by_camera(self.train).values()]
         found: list[float] = []
-        for times in sorted(map(sorted, of_cameras), key=lambda times: (-len(times), times)):
+        for times in sorted(self._times_of_cameras(), key=lambda times: (-len(times), times)):
             found = sorted([*found, *(t for t in times if not found or not found[0] <= t <= found[-1])])
         return found
 
     @property
     def interval(self) -> float:
-        """Median time from one of the ``moments`` to the next; 0 if there is one only."""
-        gaps = torch.tensor(self.moments, dtype=torch.float64).diff()
+        """Median time from a training frame to the next one of its camera, else of all; 0 if all have one time."""
+        several = [times for times in self._times_of_cameras() if len(times) > 1] or [self.moments]
+        gaps = torch.cat([torch.tensor(times, dtype=torch.float64).diff() for times in several])
         return float(gaps.median()) if len(gaps) else 0.0
+
+    def _times_of_cameras(self) -> list[list[float]]:
+        """The distinct times of the training frames of each camera, in order."""
+        return [sorted({self.cameras[n].time for n in frames}) for frames in self.by_camera(self.train).values()]
 
     def frame(self, name: str) -> Frame:
         """A frame, from the cache if it is among the last ``cache_frames`` read.

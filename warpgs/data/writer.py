@@ -176,6 +176,24 @@ def held_out(names: Sequence[str], holdout: int) -> list[str]:
     return list(names[holdout // 2 :: holdout]) if holdout else []
 
 
+def held_out_cameras(by_camera: Mapping[int, Sequence[str]], ids: Collection[int]) -> list[str]:
+    """The frames kept for evaluation: all of some cameras.
+
+    Args:
+        by_camera: Frames of each camera, as of ``Capture.by_camera``.
+        ids: Ids of the cameras; none if empty.
+
+    Raises:
+        ValueError: If there is no such camera, or no other one.
+    """
+    for i in ids:
+        if i not in by_camera:
+            raise ValueError(f"--holdout-camera {i}: there are only the cameras {', '.join(map(str, by_camera))}")
+    if ids and {*ids} == {*by_camera}:
+        raise ValueError(f"--holdout-camera {' '.join(map(str, ids))} leaves no camera to train on")
+    return [name for i, names in by_camera.items() if i in ids for name in names]
+
+
 def check_holdout(holdout: int) -> None:
     """Checks that every N-th frame can be kept for evaluation.
 

@@ -17,16 +17,21 @@ def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = N
         ValueError: If there is no such capture, or it lacks the factor.
         OSError: If it cannot be written.
     """
-    name, depth, num_frames = parse_builtin(data)
+    found = parse_builtin(data)
     require_factor(data, factor)
-    if name == "room":
+    if found.name == "room":
         from .room import builtin_capture  # imports torch
 
         return builtin_capture(quiet=quiet)
-    if name == "balls":
+    if found.name == "balls":
         from .balls import balls_capture
 
         return balls_capture(quiet=quiet)
+    if found.name == "rig":
+        from .rig import RigSize, rig_capture
+
+        size = RigSize(num_frames=found.num_frames, num_cameras=found.num_cameras, offset=found.offset)
+        return rig_capture(size=size, quiet=quiet)
     from .studio import StudioSize, studio_capture
 
-    return studio_capture(depth, size=StudioSize(num_frames=num_frames), quiet=quiet)
+    return studio_capture(found.depth, size=StudioSize(num_frames=found.num_frames), quiet=quiet)

@@ -107,16 +107,21 @@ def _pose(time: float, shift: float) -> tuple[Float[np.ndarray, "3 3"], Vector]:
     angle = -0.5 * math.pi + 0.50 * math.sin(2.0 * math.pi * (0.8 * time + 0.07))
     height = 1.78 + 0.27 * math.sin(2.0 * math.pi * (1.7 * time + 0.02))
     position = np.array([3.1 * math.cos(angle), 3.1 * math.sin(angle), height])
+    rotation = looking_at_table(position)
+    return rotation, position + shift * rotation[0]
+
+
+def looking_at_table(position: Vector) -> Float[np.ndarray, "3 3"]:
+    """World-to-camera rotation of a camera that looks at what moves, with z up."""
     forward = np.array([0.0, 0.3, 0.82]) - position
     forward /= math.sqrt(sum(x * x for x in forward.tolist()))
     right = np.array([forward[1], -forward[0], 0.0]) / math.hypot(forward[0], forward[1])
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return rotation, position + shift * right
+    return np.stack([right, np.cross(forward, right), forward])
 
 
 def _camera(time: float, shift: float, size: StudioSize) -> Camera:
     rotation, position = _pose(time, shift)
-    return _lens(size).camera(rotation, position, time)
+    return lens_of(size).camera(rotation, position, time)
 
 
 def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:
@@ -124,11 +129,15 @@ def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, 
 
     The time is in [0, 1], and the camera ``shift`` [world units] to the right of the training camera.
     """
+    return trace_from(_camera(time, shift, size), size)
+
+
+def trace_from(camera: Camera, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:
+    """The same through a camera in world units, at its time, which may be later than 1."""
     cpu = torch.device("cpu")  # a GPU rounds otherwise
     static = _static_bodies()
-    bodies = as_tensors([*static, *_moving_bodies(time)], cpu)
+    bodies = as_tensors([*static, *_moving_bodies(camera.time)], cpu)
     lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]], dtype=torch.float32)
-    camera = _camera(time, shift, size)
     traced = raytrace(bodies, lamp, even_samples(size.num_samples, cpu), camera.viewmat, camera.K, camera.size)
     return traced.image, traced.depth, traced.bodies < len(static)
 
@@ -147,44 +156,52 @@ def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:
         rotation, position = _pose(time, shift)
         writer.write_image(folder, name, to_bytes(image))
         writer.write_mask(folder, name, static.numpy())
-        writer.write_camera(folder, name, _lens(size), rotation.round(9), position.round(9))
+        writer.write_camera(folder, name, lens_of(size), rotation.round(9), position.round(9))
         if not shift:
             inverse = 1.0 / depth.numpy().astype(np.float64)
-            writer.write_depth(folder, name, _sixteen_bits(inverse, k / size.num_frames))
-            points.append(_surface_points(inverse, static.numpy(), rotation, position, k, size))
+            writer.write_depth(folder, name, sixteen_bits(inverse, k / size.num_frames))
+            count = -(-size.num_points // size.num_frames)
+            points.append(surface_points(inverse, static.numpy(), lens_of(size), (rotation, position), count, k))
     units = SceneUnits(np.array(CENTER), SCALE)
     writer.write_scene(folder, units, np.concatenate(points)[: size.num_points], near=0.05, far=3.0)
     write_stereo_index(folder, frames)
 
 
-def _lens(size: StudioSize) -> Lens:
+def lens_of(size: StudioSize) -> Lens:
+    """The lens of all cameras."""
     return Lens.centered(0.82 * size.width, (size.width, size.height))
 
 
-def _sixteen_bits(inverse: Float[np.ndarray, "H W"], phase: float) -> np.ndarray:
+def sixteen_bits(inverse: Float[np.ndarray, "H W"], phase: float) -> np.ndarray:
     """Inverse depth with a scale and an offset that drift from frame to frame, as 16 bits."""
     value = (inverse - inverse.min()) / (inverse.max() - inverse.min())
     value = (0.70 + 0.10 * math.sin(9.0 * phase)) * value + 0.12 + 0.05 * math.cos(7.0 * phase)
     return (value * 65535.0).round().astype(np.uint16)
 
 
-def _surface_points(
+def surface_points(
     inverse: Float[np.ndarray, "H W"],
     static: Bool[np.ndarray, "H W"],
-    rotation: Float[np.ndarray, "3 3"],
-    position: Vector,
-    k: int,
-    size: StudioSize,
+    lens: Lens,
+    pose: tuple[Float[np.ndarray, "3 3"], Vector],
+    count: int,
+    seed: int,
 ) -> Float[np.ndarray, "P 3"]:
-    """The sparse points of frame ``k``: random static pixels, unprojected with some noise."""
-    random = np.random.default_rng(k)
+    """The sparse points of a frame, in the world: random static pixels, unprojected with some noise.
+
+    Args:
+        inverse: [H, W] its inverse depth.
+        static: [H, W] its static mask.
+        lens: Its lens.
+        pose: Its world-to-camera rotation and its position.
+        count: Number of points, if there are as many static pixels.
+        seed: Seed of the choice and of the noise.
+    """
+    random, (rotation, position) = np.random.default_rng(seed), pose
     rows, columns = static.nonzero()
-    count = -(-size.num_points // size.num_frames)
     chosen = random.permutation(len(rows))[:count]
     row, column = rows[chosen], columns[chosen]
-    local = (
-        np.stack([*_lens(size).unproject(column + 0.5, row + 0.5), np.ones(len(row))], 1) / inverse[row, column, None]
-    )
+    local = np.stack([*lens.unproject(column + 0.5, row + 0.5), np.ones(len(row))], 1) / inverse[row, column, None]
     points = local @ rotation + position + POINT_NOISE * random.standard_normal((len(row), 3))
     return points.round(6).astype(np.float32)
 
