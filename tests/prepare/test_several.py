@@ -141,6 +141,22 @@ def test_after_an_interruption_finished_steps_are_skipped(videos, tmp_path, monk
     assert len(load_capture(root).cameras) == 18
 
 
+def test_cameras_that_all_stand_still_are_found_from_an_image_each(tmp_path):
+    """17° apart around the middle, with small images."""
+    angles = [-0.3, 0.0, 0.3, 0.6]
+    rig = [Filmed((3.4 * np.sin(a), 0.4 - 3.4 * np.cos(a), 1.2), frames=12) for a in angles]
+    videos = [event.write_video(tmp_path / f"{k}.mp4", event.trace(camera)[0]) for k, camera in enumerate(rig)]
+    lines = []
+    options = Options(masks="none", offset="0,0,0,0", selection=Selection(count=6))
+    pipeline.prepare(videos, tmp_path / "made", options, log=lines.append)
+    capture = load_capture(tmp_path / "made")
+    found = np.array([capture.cameras[f"{k}_000000"].position.numpy() for k in range(4)], np.float64)
+    truth = np.array([camera.camera(0.0).position.numpy() for camera in rig], np.float64)
+    assert boards.distances(found, truth).max() < 0.05 * np.ptp(truth, axis=0).max()
+    assert "depth: none, because no camera moves" in lines[-2]
+    assert "look at masks.png in it" in lines[-1]
+
+
 def test_a_camera_without_a_common_view_is_named(videos, tmp_path):
     other = event.write_video(tmp_path / "other.mp4", boards.record(24, moves=False)[0])
     options = Options(masks="none", offset="0,0.37,0.81,0")

@@ -71,7 +71,7 @@ def _prepare(
     report = journal.report()
     for note in report["notes"] if was_finished else []:  # the steps have logged them otherwise
         journal.log(f"note: {note}")
-    sheets = "masks.png" if options.depth_method == "none" else "masks.png and depth.png"
+    sheets = "masks.png and depth.png" if (root / "depth.png").exists() else "masks.png"
     done = f"{root} is finished: look at {sheets} in it, then run {command('check', root)}"
     journal.log(f"{root} was finished before; --force makes it again" if was_finished else done)
     return report

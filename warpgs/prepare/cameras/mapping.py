@@ -40,6 +40,10 @@ MAX_SKIPPED = 2
 MIN_PARALLEL = 1_000
 """Number of residuals from which on bundle adjustment uses all cores; COLMAP's 50,000 leave most videos to one."""
 
+FIRST_OF_FEW, NEXT_OF_FEW = 40, 15
+"""Number of matches that the first two of a few images must have, and each other one with the points that are known;
+COLMAP's 100 and 30 leave cameras out that see little in common."""
+
 TOLERANCE = 1e-6
 """Relative change of the cost at which the last bundle adjustment ends. With COLMAP's default, 0, it goes on for 100
 iterations: 86 frames of 512×384 took 2.2 s instead of 0.5 s, with the same reprojection error and camera centres."""
@@ -104,6 +108,8 @@ def _pipeline_options(job: Job) -> Any:
     options.extract_colors = False
     options.ba_refine_focal_length = job.finds_focal
     options.ba_refine_extra_params = job.params is None
+    if job.stands_still:
+        options.mapper.init_min_num_inliers, options.mapper.abs_pose_min_num_inliers = FIRST_OF_FEW, NEXT_OF_FEW
     return options
 
 

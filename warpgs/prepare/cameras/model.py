@@ -17,8 +17,9 @@ from .recovered import Cameras, NoCamerasError, require_cameras, require_frames
 MIN_ANGLE = 1.0
 """Minimum of the median triangulation angle [degrees]; with less, depth is undetermined."""
 
-MIN_POINTS = 100
-"""Minimum number of points; a camera that only rotates gives some by chance."""
+MIN_POINTS, MIN_POINTS_OF_FEW = 100, 50
+"""Minimum number of points; a camera that only rotates gives some by chance. The second is of a few cameras that stand
+still, with an image each."""
 
 MAX_ERROR = 2.0
 """Maximum mean reprojection error of a point [px]; others are omitted."""
@@ -57,7 +58,7 @@ def cameras_of_model(model: Any, groups: Sequence[Sequence[str]], sources: Seque
     length = MIN_TRACK if len(placed) > FEW_IMAGES else MIN_TRACK_OF_FEW
     points = [p for p in model.points3D.values() if p.track.length() >= length and p.error <= MAX_ERROR]
     error, angle = float(model.compute_mean_reprojection_error()), _angle(model, points)
-    _require_parallax(len(points), angle, is_one=len(groups) == 1)
+    _require_parallax(len(points), angle, is_one=len(groups) == 1, is_few=len(placed) <= FEW_IMAGES)
     return [
         Cameras(
             [Path(i.name).stem for i in own],
@@ -91,12 +92,13 @@ def _positions(points: Sequence[Any]) -> Float[np.ndarray, "P 3"]:
     return np.array([p.xyz for p in points]).reshape(-1, 3)
 
 
-def _require_parallax(num_points: int, angle: float, is_one: bool) -> None:
+def _require_parallax(num_points: int, angle: float, *, is_one: bool, is_few: bool) -> None:
     """Raises NoCamerasError if there are too few points, or the camera hardly moves."""
     whose = "the camera hardly moves" if is_one else "the cameras are at nearly one place"
-    if num_points < MIN_POINTS:
+    least = MIN_POINTS_OF_FEW if is_few and not is_one else MIN_POINTS
+    if num_points < least:
         raise NoCamerasError(
-            f"only {num_points} points were found, at least {MIN_POINTS} are needed: too little of what stands "
+            f"only {num_points} points were found, at least {least} are needed: too little of what stands "
             f"still is sharp and has texture, or {whose}"
         )
     if angle < MIN_ANGLE:

@@ -53,7 +53,7 @@ def require_cameras(counts: Sequence[int], of: Sequence[int], sources: Sequence[
         if count == 0:
             raise NoCamerasError(
                 f"{source} shares no view with the other videos: too little of what stands still is seen by it and by "
-                "another one; film the same surfaces from directions less than about 30° apart, or leave it away"
+                "another one; film the same surfaces from directions less than about 20° apart, or leave it away"
             )
         if count < MIN_REGISTERED * total:
             raise NoCamerasError(
