@@ -118,3 +118,10 @@ def test_a_point_on_the_unit_ray_of_a_pixel_has_its_image_there(lens):
     assert np.linalg.norm(rays, axis=1) == pytest.approx(1.0)
     found = lens.image(*(rays[:, :2] / rays[:, 2:]).T).T
     assert found == pytest.approx(positions, abs=1e-4)
+
+
+@pytest.mark.parametrize("lens", [Lens.centered(90.0, (64, 48)), Lens(64, 48, (90.0, 91.0), (32.0, 24.0), (0.1, 0.02))])
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_positions_in_the_image_have_the_precision_of_the_points(lens, precision):
+    assert lens.image(*np.zeros((2, 3, 4), precision)).dtype == precision
+    assert lens.project(np.ones((5, 3), precision)).dtype == precision

@@ -153,12 +153,16 @@ class Lens:
         return self.project(np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)).T.reshape(2, *np.shape(x))
 
     def project(self, viewed: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 2"]:
-        """[P, 2] where points in the camera are in the image [px from the corner], of a pinhole if in front of it."""
+        """[P, 2] where points in the camera are in the image [px from the corner], of a pinhole if in front of it.
+
+        In the precision of the points, because OpenCV misreads flow in double precision, which starts from it.
+        """
         if (distortion := self.distortion) is None:
             bent = viewed[:, :2] / viewed[:, 2:]
         else:
             bent = distortion.bend(torch.from_numpy(viewed)).numpy()
-        return bent * self.focal + self.center
+        focal, center = np.array([self.focal, self.center], bent.dtype)
+        return bent * focal + center
 
     def file_depths(self, viewed: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
         """[P] depth of points in the camera as depth files have it: z, but of a panorama the distance."""
