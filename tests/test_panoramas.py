@@ -17,6 +17,8 @@ from warpgs.data.lens import Lens
 from warpgs.export.camera_set import CameraSet
 from warpgs.export.camera_writers import write_cameras
 from warpgs.files import write_png
+from warpgs.video.filmed import Filmed, position_and_axis
+from warpgs.viewer.pose import pose_of
 
 WIDTH = 48
 
@@ -99,3 +101,15 @@ def test_a_panorama_cannot_be_taken_as_a_pinhole(folder):
 def test_panoramas_of_more_than_all_directions_are_refused(folder):
     with pytest.raises(ValueError, match="at most 180° to the sides and 90° up and down, this one 360° and 90°"):
         _ = dataclasses.replace(Lens.panorama((48, 24)), width=96, center=(48.0, 12.0)).distortion
+
+
+def test_a_viewer_sees_90_degrees_of_a_panorama_across(folder):
+    pose = pose_of(load_capture(folder).cameras["000"])
+    assert pose.fov == pytest.approx(2.0 * np.arctan(0.5))
+
+
+def test_a_panorama_has_filmed_all_directions(folder):
+    capture = load_capture(folder)
+    filmed = Filmed.by(capture, capture.points)
+    position, ahead = position_and_axis(capture.cameras["000"])
+    assert filmed.outside(position, -ahead) <= 1.0

@@ -206,9 +206,14 @@ class Camera:
         return self.distortion.shows(slopes).reshape(self.height, self.width)
 
     @property
+    def is_panorama(self) -> bool:
+        """Whether the image is equirectangular."""
+        return self.distortion is not None and self.distortion.lens == "equirectangular"
+
+    @property
     def pinhole(self) -> "Camera":
         """The camera without the distortion of its lens and with a global shutter; of a panorama 90 degrees across."""
-        if self.distortion is not None and self.distortion.lens == "equirectangular":
+        if self.is_panorama:
             K = intrinsic_matrix((self.width / 2, self.width / 2), (self.width / 2, self.height / 2))
             return dataclasses.replace(self, K=torch.tensor(K).to(self.K), distortion=None, motion=None)
         return dataclasses.replace(self, distortion=None, motion=None)

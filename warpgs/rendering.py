@@ -156,7 +156,7 @@ def render(
         background = splats.background
     _check_inputs(splats, camera, background, settings, screen_offsets)
     splats = splats.seen_from(camera.viewmat)
-    if camera.distortion is not None and camera.distortion.lens == "equirectangular":
+    if camera.is_panorama:
         splats, screen_offsets = _twice(splats, camera, screen_offsets)
         return _once(_rendered(splats, camera, screen_offsets, background, settings))
     return _rendered(splats, camera, screen_offsets, background, settings)

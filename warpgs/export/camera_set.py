@@ -47,8 +47,7 @@ class CameraSet(NamedTuple):
     @property
     def has_panoramas(self) -> bool:
         """Whether any lens is equirectangular."""
-        lenses = [camera.distortion for camera in self.cameras.values()]
-        return any(lens is not None and lens.lens == "equirectangular" for lens in lenses)
+        return any(camera.is_panorama for camera in self.cameras.values())
 
 
 def held_lens(name: str, camera: Camera, count: int) -> Lens:

@@ -63,7 +63,7 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
     filmed = None
     if capture is not None:
         track = [] if camera_paths.jumps(capture) else camera_paths.training_path(capture, keys)
-        camera = track[len(track) // 2] if track else capture.cameras[camera_paths.middle_view(capture)]
+        camera = track[len(track) // 2] if track else capture.cameras[camera_paths.middle_view(capture)].pinhole
         filmed = Filmed.by(capture, _means(cloud))
     K = camera.K.tolist()
     dynamic = cloud.select(cloud.is_dynamic)

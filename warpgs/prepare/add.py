@@ -88,7 +88,7 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
         raise ValueError(f"{root} has the layout {layout}: first copy it with warpgs import, then add to the copy")
     with lock_folder(root, "prepared"):
         capture = with_camera_ids(loader.load(root, LoadOptions(), incomplete_masks=True))
-        if any(Lens.of(camera).is_panorama for camera in capture.cameras.values()):
+        if any(camera.is_panorama for camera in capture.cameras.values()):
             raise ValueError(f"{root} is of panoramas, whose masks and depth warpgs prepare makes from the video only")
         job = _Job(root, layout, loader.default_factor, capture, read_units(root / "scene.json"), options, log)
         for part in PARTS:

@@ -94,7 +94,7 @@ class Filmed:
             np.concatenate([self.positions, position[None]]),
             np.concatenate([self.forwards, forward[None]]),
             np.append(self.depths, depth),
-            np.append(self.angles, math.atan(half)),
+            np.append(self.angles, math.pi if camera.is_panorama else math.atan(half)),
         )
 
 

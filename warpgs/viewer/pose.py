@@ -42,8 +42,8 @@ def camera_of(pose: Pose, size: tuple[int, int], time: float) -> Camera:
 
 
 def pose_of(camera: Camera) -> Pose:
-    """The pose of a camera; its principal point is lost, because a browser has none."""
-    camera = camera.to("cpu")
+    """The pose of a camera as a pinhole; its principal point is lost, because a browser has none."""
+    camera = camera.to("cpu").pinhole
     x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3].double().numpy().T).as_quat().tolist()
     fov = 2.0 * math.atan2(0.5 * camera.height, float(camera.K[1, 1]))
     return Pose((w, x, y, z), tuple(camera.position.tolist()), fov)
