@@ -1,12 +1,15 @@
 """When several videos start, from their sound or as given."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.prepare import event
+from warpgs.prepare.frames import offsets
 from warpgs.prepare.frames.offsets import Clock, check_offsets, common_clock
+from warpgs.prepare.frames.sound import Match, Onsets
 from warpgs.prepare.options import Options, Selection
 
 SECONDS = 6.0
@@ -46,6 +49,26 @@ def test_a_video_is_placed_by_another_one_than_the_first(tmp_path):
     videos = [write(tmp_path / f"{k}.mp4", start) for k, start in enumerate((2.0, 5.0, 8.0))]
     with pytest.raises(ValueError, match=r"2\.mp4 starts 6\.00 s after .*0\.mp4, which takes only 5\.88 s: they have"):
         common_clock(videos, None)
+
+
+def find(monkeypatch: pytest.MonkeyPatch, **matches: tuple[float, float]) -> list[float]:
+    """The offsets of three videos of which each pair, such as ab, has an offset and a ratio."""
+    compared = {("abc".index(pair[0]), "abc".index(pair[1])): Match(*match) for pair, match in matches.items()}
+    monkeypatch.setattr(offsets, "read_onsets", lambda *rest: Onsets(np.ones((1, 9)), 0.0))
+    monkeypatch.setattr(offsets, "compare", lambda onsets: compared)
+    return offsets.find_offsets([Path(f"{name}.mp4") for name in "abc"], [Fraction(0)] * 3)
+
+
+def test_a_video_is_placed_by_the_one_that_it_resembles_most(monkeypatch):
+    """What is not certain does not count, however far off it is."""
+    assert find(monkeypatch, ab=(1.0, 5.0), bc=(-3.0, 4.0), ac=(9.0, 1.9)) == [0.0, 1.0, -2.0]
+    assert find(monkeypatch, ab=(1.0, 2.5), bc=(-3.0, 4.0), ac=(-1.98, 3.0)) == pytest.approx([0.0, 1.02, -1.98])
+
+
+def test_sounds_that_contradict_each_other_are_refused(monkeypatch):
+    message = r"a\.mp4, but -2\.00 s as other videos say; give the time"
+    with pytest.raises(ValueError, match=r"the sounds contradict each other: c\.mp4 starts 0\.50 s after " + message):
+        find(monkeypatch, ab=(1.0, 5.0), bc=(-3.0, 4.0), ac=(0.5, 2.1))
 
 
 @pytest.mark.parametrize(
