@@ -16,7 +16,8 @@ pytestmark = pytest.mark.usefixtures("quickly")
 def test_held_out_views_are_rendered_at_regular_intervals_of_a_run(finished_run, monkeypatch):
     capture = warpgs.open_run(finished_run).open_capture()
     image = SimpleNamespace(joint=SimpleNamespace(image=torch.zeros(tiny.SCENE.height, tiny.SCENE.width, 3)))
-    scene, written = SimpleNamespace(render=lambda camera: image), []
+    config = SimpleNamespace(exposure=True)
+    scene, written = SimpleNamespace(render=lambda camera: image, config=config), []
 
     class Logger:
         def add_image(self, *_: object) -> None:

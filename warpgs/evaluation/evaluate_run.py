@@ -8,6 +8,7 @@ import torch
 from warpgs.command_line.progress import progress
 from warpgs.config import Device, NetName
 from warpgs.data.capture import Capture, Frame
+from warpgs.data.responses import camera_responses
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.files import read_json, write_json, write_png
 from warpgs.rendering import Rendering
@@ -64,9 +65,10 @@ def evaluate_run(
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     require_same_times(capture, scene.metadata)
-    save_image, align = _image_writer(run, len(capture.val)), alignment(scene, capture.median_depth)
+    gains = camera_responses(capture) if run.config.exposure else {}
+    save_image, align = _image_writer(run, len(capture.val)), alignment(scene, capture.median_depth, gains)
     network = network and network.to(scene.device)
-    evaluation = evaluate(scene, capture, network, save_image, align, quiet)
+    evaluation = evaluate(scene, capture, network, save_image, align, quiet, gains)
     values = {**evaluation.summary(), "device": device_name(scene.device), **_of_run(scene, capture)}
     _write_metrics(run, {**known, **values, "commit": commit()}, evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg

@@ -1,7 +1,8 @@
 """Alignment of held-out cameras to a scene whose training poses were corrected (direct image alignment)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from types import MappingProxyType
 
 import torch
 from jaxtyping import Bool, Float
@@ -36,12 +37,13 @@ Errors = Callable[[Float[Tensor, "6"]], Float[Tensor, " M"]]
 """Errors of an image from a pose: its rotation and translation."""
 
 
-def alignment(scene: TrainedScene, unit: float) -> Align:
+def alignment(scene: TrainedScene, unit: float, gains: Mapping[int, Tensor] = MappingProxyType({})) -> Align:
     """Aligns the cameras of frames if poses were corrected in training, else only moves them to the scene's device.
 
     Args:
         scene: The scene.
         unit: Length of a unit of translation: the median depth of the capture [scene units].
+        gains: As of ``camera_responses``: frames are divided by that of their camera.
     """
 
     def align(frame: Frame) -> Camera:
@@ -49,6 +51,8 @@ def alignment(scene: TrainedScene, unit: float) -> Align:
         if not scene.config.optim.poses:
             return camera
         truth = frame.image.to(scene.device).float() / 255.0
+        if (gain := gains.get(camera.id)) is not None:
+            truth = truth / gain.to(scene.device)
         region = camera.shown if frame.covisible is None else frame.covisible.to(scene.device)
         return aligned_camera(scene.splats(camera.time), camera, truth, unit, scene.config.render_settings, region)
 

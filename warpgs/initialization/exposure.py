@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.data.capture import Frame
+from warpgs.data.responses import BRIGHTEST, DARKEST
 from warpgs.views.views import Views
 
 MIN_JUMP = 0.1
@@ -15,9 +16,6 @@ appearance network represents slow changes; dividing them out would only hide th
 
 WIDTH = 64
 """Frames are compared at this width [px], at which a few pixels of camera motion do not matter."""
-
-DARKEST, BRIGHTEST = 0.04, 0.96
-"""Intensities outside are not compared: noise, and saturated pixels."""
 
 MIN_PIXELS = 50
 """Minimum number of compared pixels; between two frames with fewer, no jump is assumed."""

@@ -9,6 +9,7 @@ from warpgs.data.capture import Capture
 from warpgs.data.depth_alignment import typical_error
 from warpgs.data.dynamic_regions import dynamic_counts, unknown_depth
 from warpgs.data.empty_masks import wrongly_empty
+from warpgs.data.responses import camera_responses
 from warpgs.errors import command
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime import ranks
@@ -80,14 +81,19 @@ def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
 
 
 def _even_exposure(start: Start) -> Start:
-    """Divides jumps of exposure out of the images."""
-    gains = exposure_gains(start.views)
-    count = int((gains != 1.0).any(1).sum())
-    if not count:  # saves steps a division
-        return start
-    start.views.divide_by(gains)
-    low, high = gains.min().item(), gains.max().item()
-    return start.noted(f"exposure jumps: {count} frames are divided by {low:.2f} to {high:.2f}")
+    """Divides gains of cameras and jumps of exposure out of the images."""
+    gains, notes, capture = exposure_gains(start.views), [], start.capture
+    if count := int((gains != 1.0).any(1).sum()):
+        low, high = gains.min().item(), gains.max().item()
+        notes.append(f"exposure jumps: {count} frames are divided by {low:.2f} to {high:.2f}")
+    for i, gain in camera_responses(capture).items():
+        of_camera = torch.tensor([capture.cameras[name].id == i for name in capture.train])
+        gains[of_camera] *= gain
+        red, green, blue = gain.tolist()
+        notes.append(f"camera {i} is divided by its gain of {red:.2f}, {green:.2f}, {blue:.2f} (red, green, blue)")
+    if notes:  # saves steps a division
+        start.views.divide_by(gains)
+    return start.noted(*notes)
 
 
 def _may_be_tracked(start: Start) -> bool:

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from warpgs.command_line.progress import progress
 from warpgs.data.capture import missing_view
 from warpgs.data.images import decode
+from warpgs.data.responses import camera_responses, in_response
 from warpgs.evaluation.poses import alignment
 from warpgs.runs.run import Device, Run
 from warpgs.visualize.images import CAPTION_HEIGHT, error_image, reduced, to_bytes
@@ -73,7 +74,8 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
     """
     run = Run.open(evaluated.folder, device)
     capture, scene = run.open_capture(quiet), run.trained_scene()
-    align = alignment(scene, capture.median_depth)
+    gains = camera_responses(capture) if run.config.exposure else {}
+    align = alignment(scene, capture.median_depth, gains)
     strips = {}
     for name in progress(names, f"rendering {evaluated.label}", quiet):
         if name not in capture.cameras:
@@ -81,9 +83,10 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
         frame = capture.frame(name)
         truth = frame.image.to(scene.device).float() / 255.0
         rendering = scene.render(align(frame), branches=True)
-        layers = (rendering.joint, rendering.static, rendering.dynamic)
+        joint = rendering.joint._replace(image=in_response(rendering.joint.image, frame, gains))
+        layers = (joint, rendering.static, rendering.dynamic)
         shown = [to_bytes(layer.image) for layer in layers if layer is not None]
-        error = error_image(rendering.joint.image.clamp(0, 1), truth)
+        error = error_image(joint.image.clamp(0, 1), truth)
         strips[name] = Strip(*map(data_uri, (to_bytes(truth), *shown, error)))
     measured, newest = evaluated.metrics.get("iterations"), scene.metadata.iteration
     note = "" if measured == newest else f"the images are of iteration {newest}, the metrics of iteration {measured}"

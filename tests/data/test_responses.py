@@ -1,0 +1,107 @@
+"""Gains of several cameras, from the colours of points."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests import tiny
+from warpgs.captures.opening import load_capture
+from warpgs.data.responses import camera_responses, in_response
+from warpgs.evaluation.evaluate import evaluate
+from warpgs.initialization.prepare_start import prepare_start
+from warpgs.rendering import Layer, Rendering
+from warpgs.synthetic.rig import RigSize, rig_capture
+
+SIZE = RigSize(width=160, height=90, num_frames=2, num_samples=4, num_points=1000)
+GAINS = {2: torch.tensor([1.25, 1.0, 0.8]), 4: torch.tensor([0.7, 0.75, 0.8])}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return rig_capture(tmp_path_factory.mktemp("cache"), SIZE, quiet=True)
+
+
+@pytest.fixture(scope="module")
+def plain(folder):
+    return load_capture(folder)
+
+
+def with_gains(capture, gains):
+    """The capture with frames of some cameras multiplied by factors."""
+
+    def read(name):
+        frame = capture.frame(name)
+        gain = gains.get(frame.camera.id, torch.ones(3))
+        return dataclasses.replace(frame, image=(frame.image * gain).round().clamp(0, 255).byte())
+
+    return dataclasses.replace(capture, read=read)
+
+
+def test_gains_of_cameras_are_found(plain):
+    found = camera_responses(with_gains(plain, GAINS))
+    assert {*found} == {*GAINS}
+    for i, gain in GAINS.items():
+        assert found[i].tolist() == pytest.approx(gain.tolist(), rel=0.03)
+
+
+def test_cameras_that_are_alike_have_no_gains(plain):
+    assert camera_responses(plain) == {}
+
+
+def test_one_camera_has_no_gain(plain):
+    alone = with_gains(plain, {1: torch.full((3,), 0.5)}).split(plain.by_camera(plain.train)[1], ())
+    assert camera_responses(alone) == {}
+
+
+def test_without_points_there_are_no_gains(plain):
+    bare = dataclasses.replace(with_gains(plain, GAINS), points=torch.zeros(0, 3))
+    assert camera_responses(bare) == {}
+
+
+def test_a_camera_that_shares_no_points_keeps_its_gain(plain):
+    away = {}
+    for name in plain.by_camera(plain.train)[4]:
+        viewmat = plain.cameras[name].viewmat.clone()
+        viewmat[2, 3] = -100.0
+        away[name] = dataclasses.replace(plain.cameras[name], viewmat=viewmat)
+    found = camera_responses(with_gains(plain, GAINS).with_cameras(away))
+    assert {*found} == {2}
+
+
+def test_saturated_pixels_do_not_count(plain):
+    found = camera_responses(with_gains(plain, {3: torch.full((3,), 1.5)}))
+    assert found[3].tolist() == pytest.approx([1.5] * 3, rel=0.04)
+
+
+def test_training_divides_gains_out_and_says_so(folder, plain):
+    config = dataclasses.replace(tiny.CONFIG, data=folder, exposure=True)
+    start = prepare_start(config, with_gains(plain, GAINS))
+    told = [note for note in start.notes if "its gain of" in note]
+    assert [note.split(" is ")[0] for note in told] == ["camera 2", "camera 4"]
+    for k, name in enumerate(plain.train):
+        expected = plain.frame(name).image.float() / 255.0
+        assert float((start.views[k].image - expected).abs().median()) < 0.02
+
+
+def test_a_rendering_is_compared_as_its_camera_records_it(plain):
+    recorded = with_gains(plain, GAINS)
+    capture = recorded.split(recorded.by_camera(recorded.train)[1], recorded.by_camera(recorded.train)[2])
+
+    class Perfect:
+        device = torch.device("cpu")
+
+        def render(self, camera, *, branches=False):
+            names = (name for name, c in plain.cameras.items() if (c.id, c.time) == (camera.id, camera.time))
+            frame = plain.frame(next(names))
+            layer = Layer(frame.image.float() / 255.0, torch.ones(frame.image.shape[:2]), None)
+            return Rendering(layer, layer, layer, torch.zeros(0, 2, dtype=torch.int32), None, None, None)
+
+        def play(self, camera):
+            return self.render(camera).joint.image
+
+    frame = capture.frame(capture.val[0])
+    assert torch.equal(in_response(torch.ones(2, 2, 3), frame, GAINS), GAINS[2].expand(2, 2, 3))
+    without, with_gain = (evaluate(Perfect(), capture, quiet=True, gains=g).summary()["psnr"] for g in ({}, GAINS))
+    assert without < 25.0
+    assert with_gain > 35.0
