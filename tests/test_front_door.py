@@ -93,7 +93,7 @@ def test_train_is_a_command_and_a_script():
     [
         "prepare video capture",
         "prepare capture --add masks",
-        "sample video.mp4",
+        "demo",
         "import source capture",
         "check capture",
         "train",

@@ -31,9 +31,10 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
     if bands < asked:
         notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} times determine no more")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
-    poses = config.optim.poses * min(1.0, num / MANY_FRAMES)
+    seen = len(capture.train)
+    poses = config.optim.poses * min(1.0, seen / MANY_FRAMES)
     if poses < config.optim.poses:
-        notes.append(f"corrections of poses learn at {poses:.1e}: each of {num} frames is seen often")
+        notes.append(f"corrections of poses learn at {poses:.1e}: each of {seen} frames is seen often")
         config = dataclasses.replace(config, optim=dataclasses.replace(config.optim, poses=poses))
     branches = loss.branches_in_stage2 != "no"
     if loss.branches_in_stage2 == "given-masks" and capture.assuming(config.assumption).uses_estimated_masks:
