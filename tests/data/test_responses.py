@@ -79,6 +79,7 @@ def test_training_divides_gains_out_and_says_so(folder, plain):
     start = prepare_start(config, with_gains(plain, GAINS))
     told = [note for note in start.notes if "its gain of" in note]
     assert [note.split(" is ")[0] for note in told] == ["camera 2", "camera 4"]
+    assert "camera 0 trains nothing: it is evaluated with the median gain, 1" in start.notes
     for k, name in enumerate(plain.train):
         expected = plain.frame(name).image.float() / 255.0
         assert float((start.views[k].image - expected).abs().median()) < 0.02

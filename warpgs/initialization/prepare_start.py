@@ -86,11 +86,14 @@ def _even_exposure(start: Start) -> Start:
     if count := int((gains != 1.0).any(1).sum()):
         low, high = gains.min().item(), gains.max().item()
         notes.append(f"exposure jumps: {count} frames are divided by {low:.2f} to {high:.2f}")
-    for i, gain in camera_responses(capture).items():
+    trained, responses = {*capture.by_camera(capture.train)}, camera_responses(capture)
+    for i, gain in responses.items():
         of_camera = torch.tensor([capture.cameras[name].id == i for name in capture.train])
         gains[of_camera] *= gain
         red, green, blue = gain.tolist()
         notes.append(f"camera {i} is divided by its gain of {red:.2f}, {green:.2f}, {blue:.2f} (red, green, blue)")
+    if responses and (others := [i for i in capture.by_camera(capture.val) if i not in trained]):
+        notes.append(f"camera {', '.join(map(str, others))} trains nothing: it is evaluated with the median gain, 1")
     if notes:  # saves steps a division
         start.views.divide_by(gains)
     return start.noted(*notes)
