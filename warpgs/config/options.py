@@ -29,10 +29,10 @@ class TrainConfig:
     """Trains SplitGaussian on a capture, or on the built-in scene if no capture is given."""
 
     data: Path | None = None
-    """Folder of the capture, or builtin:studio (docs/cluster.md) or builtin:balls; builtin:room if omitted."""
+    """Folder of the capture, or builtin:studio (docs/cluster.md), builtin:rig or builtin:balls; else builtin:room."""
     dataset: str | None = None
-    """Layout of the capture: nerfds, hypernerf, iphone, nerfstudio, blender (D-NeRF), llff (NVIDIA), colmap, vipe or
-    megasam; recognized from its files if omitted."""
+    """Layout of the capture: nerfds, hypernerf, iphone, nerfstudio, blender (D-NeRF), dynerf, llff (NVIDIA), colmap,
+    vipe or megasam; recognized from its files if omitted."""
     factor: Annotated[int | None, Bounds(min=1, max=1024)] = None
     """Downscaling factor of the images (folder rgb/<factor>x); the dataset's default if omitted."""
     distortion: bool = True
