@@ -311,3 +311,11 @@ def test_without_a_capture_no_cameras_and_no_scene_are_written(run, tmp_path, ca
 def test_one_path_is_filmed_at_a_time(run, capsys):
     assert main(["render", str(run), "--cameras", "a", "--path", "fixed"]) == 2
     assert "--cameras define the path: omit --path" in capsys.readouterr().err
+
+
+def test_another_file_than_one_of_cameras_is_refused_by_what_it_should_be(run, tmp_path, capsys):
+    (tmp_path / "scene.ply").write_bytes(b"ply\n\xff")
+    assert main(["render", str(run), "--cameras", str(tmp_path / "scene.ply")]) == 2
+    assert (
+        "scene.ply is neither a transforms.json nor a folder that has one or a COLMAP model" in capsys.readouterr().err
+    )

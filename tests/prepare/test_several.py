@@ -164,6 +164,13 @@ def test_a_camera_without_a_common_view_is_named(videos, tmp_path):
         pipeline.prepare([*videos, other], tmp_path / "made", options)
 
 
+def test_a_video_without_texture_is_named(videos, tmp_path):
+    blank = event.write_video(tmp_path / "blank.mp4", [np.full((180, 320, 3), 90, np.uint8)] * 24)
+    options = Options(masks="none", offset="0,0.37")
+    with pytest.raises(NoCamerasError, match=r"the frames of .*blank\.mp4 have hardly any texture: 0 features"):
+        pipeline.prepare([videos[0], blank], tmp_path / "made", options)
+
+
 @pytest.mark.parametrize(
     ("sources", "options", "message"),
     [

@@ -40,7 +40,10 @@ def read_cameras(path: Path, capture: Capture) -> list[Camera]:
     if path.is_dir() and not (path / INDEX).is_file():
         named, times = _of_colmap(path)
     else:
-        named, times = _of_transforms(path / INDEX if path.is_dir() else path)
+        index = path / INDEX if path.is_dir() else path
+        if index.suffix != ".json":
+            raise ValueError(f"{path} is neither a transforms.json nor a folder that has one or a COLMAP model")
+        named, times = _of_transforms(index)
     if len(named) > MAX_FRAMES:
         raise ValueError(f"{path} has {len(named):,} cameras, the maximum is {MAX_FRAMES:,}")
     names = [Path(name).stem for name, _ in named]

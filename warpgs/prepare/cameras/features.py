@@ -191,13 +191,17 @@ def static_database(job: Job) -> Path:
     """A copy of the database with the matches in static regions of the job's frames."""
     database = job.database.with_suffix(".static.db")
     shutil.copyfile(job.database, database)
-    features = keep_static(database, None if job.masks is None else Path(job.masks), job.files, job.unmasked)
-    if features < MIN_FEATURES:
+    counts = keep_static(database, None if job.masks is None else Path(job.masks), job.files, job.unmasked)
+    for camera, group in enumerate(job.groups):
+        features = sum(counts[k] for k in group) / len(group)
+        if features >= MIN_FEATURES:
+            continue
+        of = f" of {job.sources[camera]}" if job.sources else ""
         where, remedy = "", "record textured objects, in more light"
         if job.masks is not None:
             where, remedy = " in static regions", f"{remedy}, or check the masks, in which 0 must mean dynamic"
         raise NoCamerasError(
-            f"the frames have hardly any texture{where}: {features:.0f} features per frame, at least {MIN_FEATURES} "
-            f"are needed; {remedy}"
+            f"the frames{of} have hardly any texture{where}: {features:.0f} features per frame, at least "
+            f"{MIN_FEATURES} are needed; {remedy}"
         )
     return database

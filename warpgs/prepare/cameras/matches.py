@@ -145,8 +145,8 @@ def has_features(database: Path, names: list[str], num_pairs: int) -> bool:
         opened.close()
 
 
-def keep_static(database: Path, masks: Path | None, names: list[str], unmasked: Collection[str] = ()) -> float:
-    """Removes matches of other images, and those in dynamic regions; returns the mean number of static features.
+def keep_static(database: Path, masks: Path | None, names: list[str], unmasked: Collection[str] = ()) -> list[int]:
+    """Removes matches of other images, and those in dynamic regions; returns each image's number of static features.
 
     Args:
         database: COLMAP's database, which is changed.
@@ -156,10 +156,12 @@ def keep_static(database: Path, masks: Path | None, names: list[str], unmasked: 
     """
     opened = pycolmap.Database.open(database)
     try:
-        static = {}
+        static, counts = {}, dict.fromkeys(names, 0)
         for image in opened.read_all_images():
             own = None if image.name in unmasked else masks
-            static[image.image_id] = _static(opened, image, own, image.name in names)
+            static[image.image_id] = kept = _static(opened, image, own, image.name in names)
+            if image.name in counts:
+                counts[image.name] = int(kept.sum())
         for key, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             a, b = pycolmap.pair_id_to_image_pair(key)
             matches = np.asarray(geometry.inlier_matches)
@@ -169,7 +171,7 @@ def keep_static(database: Path, masks: Path | None, names: list[str], unmasked: 
                 opened.update_two_view_geometry(a, b, geometry)
     finally:
         opened.close()
-    return sum(int(kept.sum()) for kept in static.values()) / len(names)
+    return list(counts.values())
 
 
 def _static(opened: Any, image: Any, masks: Path | None, is_wanted: bool) -> Bool[np.ndarray, " K"]:
