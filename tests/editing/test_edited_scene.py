@@ -154,6 +154,12 @@ def test_isolation_is_one_in_regions_of_any_density():
     assert isolation(alone)[-1] > 5
 
 
+def test_points_that_are_not_finite_isolate_no_others():
+    points = np.random.default_rng(0).random((40, 3))
+    among = np.insert(points, 7, np.nan, axis=0)
+    assert np.array_equal(np.delete(isolation(among), 7), isolation(points))
+
+
 @pytest.mark.parametrize("count", [0, 1, NUM_NEIGHBORS])
 def test_few_points_are_not_isolated(count):
     assert (isolation(np.random.default_rng(0).random((count, 3))) == 1).all()

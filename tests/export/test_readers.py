@@ -184,6 +184,16 @@ def test_all_primitives_of_gltf_are_read(tmp_path):
     assert len(read_cloud(twice)) == 10
 
 
+def test_gltf_whose_nodes_show_one_mesh_without_end_is_refused(tmp_path):
+    def repeat(document):
+        document["nodes"] = [{"mesh": 0}] * 20_000
+        document["scenes"] = [{"nodes": list(range(20_000))}]
+
+    write_glb(tmp_path / "a.glb", scenes.cloud(100))
+    with pytest.raises(ValueError, match=r"a\.glb is damaged: it claims 112,000,000 bytes of Gaussians in "):
+        read_cloud(edit_glb(tmp_path / "a.glb", repeat))
+
+
 def test_normalized_integers_of_gltf_are_read(tmp_path):
     cloud = scenes.cloud(1, 0)
     path = tmp_path / "a.glb"

@@ -57,6 +57,13 @@ def test_a_file_is_rendered_with_the_anti_aliasing_it_was_trained_with(tmp_path,
     assert (shown - scenes.image(other)).abs().max() > 1e-3
 
 
+def test_a_file_next_to_a_run_of_its_name_has_a_folder_of_its_own(file):
+    assert open_scene(file, "cpu").folder.name == "a"
+    file.with_suffix("").mkdir()
+    (file.with_suffix("") / "config.json").touch()
+    assert open_scene(file, "cpu").folder.name == "a-ply"
+
+
 def test_a_file_is_the_same_at_all_times(file):
     scene = open_run(str(file), "cpu")
     first, last = (scene.render(scenes.camera(time=time)).joint.image for time in (0.0, 1.0))

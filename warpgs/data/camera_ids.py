@@ -61,7 +61,7 @@ def _by_split(capture: Capture, names: Sequence[str]) -> list[list[str]]:
 
 def _unknown(capture: Capture, names: Sequence[str]) -> str:
     times = {name: capture.cameras[name].time for name in names}
-    first, second = next((a, b) for a, b in pairwise(names) if times[a] == times[b])
+    first, second = next((a, b) for a, b in pairwise(sorted(names, key=times.__getitem__)) if times[a] == times[b])
     if len({camera.id for camera in capture.cameras.values()}) > 1:
         same = f"frames {first} and {second} are of camera {capture.cameras[first].id} at one time"
         raise ValueError(f"{capture.name}: {same}: give each camera an id of its own")

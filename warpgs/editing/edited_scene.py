@@ -109,6 +109,11 @@ def isolation(points: np.ndarray) -> np.ndarray:
     outlier factor (Breunig et al. 2000), about 1 in regions of any density. At most as many points have no neighbours
     to compare: theirs is 1.
     """
+    finite = np.isfinite(points).all(1)
+    if not finite.all():  # which the search for neighbours refuses; such Gaussians are never drawn
+        found = np.ones(len(points))
+        found[finite] = isolation(points[finite])
+        return found
     if len(points) <= NUM_NEIGHBORS:
         return np.ones(len(points))
     distances, neighbors = cKDTree(points).query(points, NUM_NEIGHBORS + 1)

@@ -16,12 +16,16 @@ from warpgs.files import MAX_NUMBER, read_bounded, read_numbers
 from warpgs.ops.sh import MAX_DEGREE, num_bases
 from warpgs.parsed import parse_json
 
+from .bounds import require_plausible
 from .cloud import ARRAYS, MIN_SCALE, Cloud, logit, unit_quats
 from .gltf import BINARY_CHUNK, EXTENSION, JSON_CHUNK, MAGIC, MAX_BYTES, TYPES
 from .rotation import rotated
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 """NumPy types of componentType; integers are normalized."""
+
+ROW_BYTES = 4 * (3 + 4 + 3 + 1 + 3)
+"""Size of a Gaussian without directional colours in memory [bytes]."""
 
 READ = (EXTENSION, "KHR_mesh_quantization")
 """Extensions that a file may require."""
@@ -34,7 +38,10 @@ def read_glb(path: Path) -> Cloud:
         ValueError: If it is another file, damaged, or has what is not supported; the message names it.
     """
     document = _Document(path)
-    clouds = [document.cloud(primitive, matrix) for primitive, matrix in document.placed_primitives()]
+    placed = [*document.placed_primitives()]
+    claimed = ROW_BYTES * sum(document.count(primitive) for primitive, _ in placed)  # many nodes may show one mesh
+    require_plausible(path, claimed, path.stat().st_size)
+    clouds = [document.cloud(primitive, matrix) for primitive, matrix in placed]
     if not clouds:
         raise ValueError(f"{path} has no primitive with {EXTENSION}")
     most = max(cloud.sh.shape[1] for cloud in clouds)
@@ -87,6 +94,10 @@ class _Document:
                     if EXTENSION in self._get(self._item(primitives, k), "extensions", {}):
                         yield primitives[k], matrix
 
+    def count(self, primitive: dict[str, Any]) -> int:
+        """Number of Gaussians of a primitive."""
+        return self._accessor(self._get(primitive, "attributes", {}), "POSITION", 3).shape[0]
+
     def cloud(self, primitive: dict[str, Any], matrix: Float64[np.ndarray, "4 4"]) -> Cloud:
         """The Gaussians of a primitive in the world."""
         extension = self._get(primitive["extensions"], EXTENSION, {})
@@ -95,7 +106,7 @@ class _Document:
         if (space := extension.get("colorSpace", "srgb_rec709_display")) != "srgb_rec709_display":
             raise ValueError(f"{self.path} has colours in {reprlib.repr(space)}, only srgb_rec709_display is read")
         attributes = self._get(primitive, "attributes", {})
-        N = self._accessor(attributes, "POSITION", 3).shape[0]
+        N = self.count(primitive)
 
         def values(name: str, width: int) -> np.ndarray:
             found = self._accessor(attributes, name, width)
@@ -131,7 +142,13 @@ class _Document:
         offset, dtype = self._get(accessor, "byteOffset", 0), np.dtype(COMPONENTS[kind])
         row = width * dtype.itemsize
         end = offset + max(count - 1, 0) * (stride or row) + row
-        if min(count, start, size, stride, offset) < 0 or buffer or start + size > len(self.buffer) or end > size:
+        if (
+            min(count, start, size, stride, offset) < 0
+            or 0 < stride < row
+            or buffer
+            or start + size > len(self.buffer)
+            or end > size
+        ):
             raise ValueError(f"{self.path} is damaged: {name} is beyond the end of its buffer")
         strides = (stride or row, dtype.itemsize)
         values = np.ndarray((count, width), dtype, self.buffer, start + offset, strides)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.prepare import event
-from warpgs.prepare.frames import offsets
+from warpgs.prepare.frames import offsets, sound
 from warpgs.prepare.frames.offsets import Clock, check_offsets, common_clock
 from warpgs.prepare.frames.sound import Match, Onsets
 from warpgs.prepare.options import Options, Selection
@@ -82,6 +82,13 @@ def test_a_video_whose_sound_does_not_tell_when_it_starts_is_named(tmp_path, see
     videos = [write(tmp_path / "a.mp4", 3.0), write(tmp_path / "b.mp4", 3.37), write(tmp_path / "c.mp4", 3, seed=seed)]
     with pytest.raises(ValueError, match=message):
         common_clock(videos, None)
+
+
+def test_sounds_too_short_to_compare_other_lags_tell_nothing():
+    a, b = (np.random.default_rng(k).random(255) for k in (0, 1))
+    sums = [np.concatenate([[0.0], np.cumsum(x**2)]) for x in (a, b)]
+    correlation = np.fft.irfft(np.fft.rfft(a, 512) * np.fft.rfft(b, 512).conj())
+    assert sound._peak(correlation, *sums)[1] == 0.0
 
 
 def test_silence_is_no_sound(tmp_path):

@@ -170,7 +170,8 @@ def _peak(
     best, width = int(score.argmax()), round(PEAK_WIDTH * RATE / HOP)
     others = score.copy()
     others[max(0, best - width) : best + width + 1] = 0.0
-    ratio = float(score[best] / max(others.max(), 1e-9)) if score[best] > 0.0 else 0.0
+    # Without other lags to compare with, nothing says that this one is right.
+    ratio = float(score[best] / others.max()) if score[best] > 0.0 and others.max() > 0.0 else 0.0
     before, peak, after = score[[max(best - 1, 0), best, min(best + 1, len(score) - 1)]]
     bend = before - 2.0 * peak + after
     return float(lags[best]) + (0.5 * float((before - after) / bend) if bend < 0.0 else 0.0), ratio
