@@ -15,6 +15,7 @@ from warpgs.export.export_run import export_run
 from warpgs.export.options import Export
 from warpgs.formats.readers import read_cloud
 from warpgs.formats.standard import read_standard, write_standard
+from warpgs.runs import scene_file
 from warpgs.runs.opening import open_run, open_scene
 from warpgs.video.options import Render
 from warpgs.video.render_run import render_run
@@ -62,6 +63,17 @@ def test_a_file_next_to_a_run_of_its_name_has_a_folder_of_its_own(file):
     file.with_suffix("").mkdir()
     (file.with_suffix("") / "config.json").touch()
     assert open_scene(file, "cpu").folder.name == "a-ply"
+
+
+def test_as_many_files_stay_in_memory_as_if_all_were_as_large_as_the_largest(tmp_path, monkeypatch):
+    monkeypatch.setattr(scene_file, "MAX_CACHE_BYTES", 1_000_000)
+    for k, count in enumerate((1, 2_000, 2_000, 2_000, 2_000, 2_000, 2_000, 2_000, 2_000, 2_000)):
+        write_standard(tmp_path / f"scene_{k}.ply", scenes.cloud(count))
+    scene = open_run(tmp_path, "cpu")
+    for k in range(10):
+        scene.splats(k / 9)
+    assert 2 <= scene._frame.cache_info().currsize <= 6
+    assert sum(tensor.nbytes for tensor in scene._frame(9).dynamic.state_dict().values()) > 100_000
 
 
 def test_a_file_is_the_same_at_all_times(file):

@@ -92,7 +92,9 @@ class SceneSequence(TrainedScene):
         super().__init__(_scene_of(first, config, True).to(config.device), config, _metadata_of(first))
         self.files = files
         size = sum(tensor.nbytes for tensor in self.scene.dynamic.state_dict().values())
-        self._frame = lru_cache(maxsize=max(2, MAX_CACHE_BYTES // size))(self._read)
+        stored = [file.stat().st_size for file in files]
+        largest = max(size * max(stored) // stored[0], max(stored))  # of small files most is the header
+        self._frame = lru_cache(maxsize=max(2, MAX_CACHE_BYTES // largest))(self._read)
 
     def has_same_gaussians(self) -> bool:
         """Whether all files have one number of Gaussians, as those of one moving scene do; reads them all."""
