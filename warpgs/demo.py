@@ -32,6 +32,7 @@ def run(options: Demo) -> int:
     """
     with ending_at_once():
         from .prepare.frames.sample import write_sample  # imports torch and Warp
+        from .runs.config_file import NAME
         from .runtime.devices import choose_device
     folder = options.folder
     video, capture, trained = folder / "video.mp4", folder / "capture", folder / "run"
@@ -42,7 +43,7 @@ def run(options: Demo) -> int:
     training = ["--data", capture, "--preset", preset, "--out", trained]
     for arguments in (
         ["prepare", video, capture, "--holdout", 8],
-        ["train", *(["--resume", trained] if (trained / "config.json").exists() else training)],
+        ["train", *(["--resume", trained] if (trained / NAME).exists() else training)],
         ["export", trained, "--format", "html"],
     ):
         show(f"$ {command(*arguments)}")

@@ -33,7 +33,7 @@ def open_scene(path: Path, device: Device | None = None, data: Path | None = Non
         return Run.open(path, device, data)
     name = files[0].name.split(".")[0] or files[0].name
     folder = path if path.is_dir() else path.with_name(name)
-    if (folder / "config.json").exists():  # of a run, whose edits and videos are its own
+    if (folder / NAME).exists():  # of a run, whose edits and videos are its own
         folder = path.with_name(files[0].name.replace(".", "-"))
     plan = Plan.of(TrainConfig(data=data, out=folder, preset=None), choose_device(device), "black", False)
     return SceneFile(folder, plan, files)
