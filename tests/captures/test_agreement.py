@@ -36,7 +36,7 @@ def write_rig(root: Path, places: list[float]) -> Path:
         rig.append(Cameras(names, boards.lens(), np.array([place(x)] * COUNT), boards.points(), 0.1, 9.0))
         write_frames(root, root / "frames", rig[-1], masks)
         times |= {name: 100 * shot + 10 * k for shot, name in enumerate(names)}
-    write_scene(root, rig, boards.points(), times, holdout=0)
+    write_scene(root, rig, boards.points(), times)
     return root
 
 

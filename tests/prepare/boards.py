@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from warpgs.data.lens import Lens
+from warpgs.data.writer import held_out
 from warpgs.prepare.cameras.posed_frames import PosedFrames
 from warpgs.prepare.cameras.recovered import Cameras
 from warpgs.prepare.scene import write_frames, write_scene
@@ -179,7 +180,7 @@ def write_capture(root: Path, num_frames: int = 16, holdout: int = 0) -> Path:
     names = [path.stem for path in sorted((root / "frames").iterdir())]
     cameras = true_cameras(root, names)
     write_frames(root, root / "frames", cameras, masks)
-    write_scene(root, [cameras], cameras.points, {name: k for k, name in enumerate(names)}, holdout)
+    write_scene(root, [cameras], cameras.points, {name: k for k, name in enumerate(names)}, held_out(names, holdout))
     return root
 
 

@@ -208,11 +208,12 @@ def test_a_finished_capture_is_not_changed(made, shots):
     assert (made / "dataset.json").stat().st_mtime_ns == before
 
 
-def test_a_capture_finished_before_there_was_an_option_stays_finished(made, shots):
+@pytest.mark.parametrize("option", ["camera", "holdout_camera"])
+def test_a_capture_finished_before_there_was_an_option_stays_finished(made, shots, option):
     path = made / ".prepare" / "state.json"
     copy = path.read_text()
     state = json.loads(copy)
-    del state["options"]["camera"]
+    del state["options"][option]
     path.write_text(json.dumps(state))
     prepare(shots, made, holdout=8)
     path.write_text(copy)

@@ -79,7 +79,7 @@ def test_frames_and_masks_are_written_as_they_were_recorded_with_their_lens(mode
     cameras = boards.true_cameras(frames, names)
     lens = dataclasses.replace(cameras.lens, coefficients=(0.05, -0.01), model=model)
     write_frames(tmp_path / "made", frames, dataclasses.replace(cameras, lens=lens), masks)
-    write_scene(tmp_path / "made", [cameras], cameras.points, {name: k for k, name in enumerate(names)}, 4)
+    write_scene(tmp_path / "made", [cameras], cameras.points, {name: k for k, name in enumerate(names)})
     frame = load_capture(tmp_path / "made").frame(names[3])
     assert np.array_equal(frame.image.numpy(), images[3])
     assert np.array_equal(~frame.static_mask.numpy(), masks[3])

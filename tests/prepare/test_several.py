@@ -14,6 +14,7 @@ from warpgs.captures.opening import load_capture
 from warpgs.cli import main
 from warpgs.prepare import pipeline
 from warpgs.prepare.cameras.recovered import NoCamerasError
+from warpgs.prepare.checks import find_videos
 from warpgs.prepare.options import Options, Selection
 
 CAMERAS = [
@@ -126,19 +127,33 @@ def test_a_finished_capture_is_not_made_again(made, videos):
     assert (made / "dataset.json").stat().st_mtime_ns == before
 
 
-def test_after_an_interruption_finished_steps_are_skipped(videos, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def resumed(videos):
+    """The capture of a preparation that was interrupted, of the frames of one camera for evaluation."""
+
     def interrupted(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    root, options = tmp_path / "made", Options(masks="none", depth="none", selection=Selection(count=6))
-    with monkeypatch.context() as patch:
+    root = videos[0].parent / "resumed"
+    options = Options(masks="none", depth="none", selection=Selection(count=6), holdout_camera=("b",))
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr("warpgs.prepare.steps.write_capture", interrupted)
         with pytest.raises(KeyboardInterrupt):
             pipeline.prepare(videos, root, options)
-    for finished in ("take_videos", "recover_several"):
-        monkeypatch.setattr(f"warpgs.prepare.steps.{finished}", interrupted)
-    pipeline.prepare(videos, root, options)
-    assert len(load_capture(root).cameras) == 18
+    with pytest.MonkeyPatch.context() as patch:
+        for finished in ("take_videos", "recover_several"):
+            patch.setattr(f"warpgs.prepare.steps.{finished}", interrupted)
+        pipeline.prepare(videos, root, options)
+    return load_capture(root)
+
+
+def test_after_an_interruption_finished_steps_are_skipped(resumed):
+    assert len(resumed.cameras) == 18
+
+
+def test_a_whole_camera_is_held_out(resumed):
+    assert sorted(resumed.val) == [f"1_{k:06d}" for k in range(6)]
+    assert len(resumed.train) == 12
 
 
 def test_cameras_that_all_stand_still_are_found_from_an_image_each(tmp_path):
@@ -181,6 +196,13 @@ def test_a_video_without_texture_is_named(videos, tmp_path):
         (["a.mp4", "b.mp4"], {"offset": "1"}, "--offset must be a time for each of the 2 videos"),
         (["a.mp4", "b.mp4"], {"offset": "0,9"}, "b.mp4 starts 9.00 s after .*a.mp4, which takes only"),
         (["a.mp4"], {"offset": "0"}, "--offset is for several videos"),
+        (
+            ["a.mp4", "b.mp4"],
+            {"holdout_camera": ("d",)},
+            "--holdout-camera must be one of a.mp4, b.mp4, got 'd'",
+        ),
+        (["a.mp4", "b.mp4"], {"holdout_camera": ("a", "b.mp4")}, "--holdout-camera a b.mp4 leaves no camera to train"),
+        (["a.mp4"], {"holdout_camera": ("a",)}, "--holdout-camera a leaves no camera to train on"),
     ],
 )
 def test_several_videos_that_do_not_fit_are_refused(videos, tmp_path, sources, options, message):
@@ -195,6 +217,13 @@ def test_a_focal_length_of_videos_of_several_sizes_is_refused(videos, tmp_path):
     options = Options(focal=250.0, offset="0,0")
     with pytest.raises(ValueError, match="--focal and --intrinsics are of all videos, which have several sizes"):
         pipeline.prepare([videos[0], small], tmp_path / "made", options)
+
+
+def test_a_video_is_named_by_its_path_or_its_file_unless_that_is_of_several():
+    sources = ["left/a.mp4", "right/a.mp4", "b.mp4"]
+    assert find_videos(sources, ["right/a.mp4", "b"]) == [1, 2]
+    with pytest.raises(ValueError, match=r"--holdout-camera a may be left/a\.mp4 or right/a\.mp4: give its path"):
+        find_videos(sources, ["a"])
 
 
 def test_the_last_path_of_the_command_is_the_capture(tmp_path, capsys):

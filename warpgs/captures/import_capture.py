@@ -1,6 +1,6 @@
 """Copies a capture of any layout into the layout of warpgs, in scene units."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -51,11 +51,11 @@ def import_capture(
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ValueError(f"{target} is not an empty folder: choose a new one for the capture")
     capture, renamed = _with_plain_ids(load_capture(source, dataset, factor=factor, cache_frames=2))
-    by_camera = capture.by_camera((*capture.train, *capture.val))
-    names = [*chain(*by_camera.values())]  # videos are decoded in order
-    val = _held_out(capture, by_camera, holdout, holdout_camera)
+    by_camera = capture.by_camera((*capture.train, *capture.val))  # videos are decoded in order
+    chooses = holdout is not None or bool(holdout_camera)
+    val = writer.held_out_of(by_camera, holdout or 0, holdout_camera) if chooses else [*capture.val]
     with complete_or_absent(target) as folder:
-        counts = _write_frames(folder, capture, names, quiet=log is None)
+        counts = _write_frames(folder, capture, names := [*chain(*by_camera.values())], quiet=log is None)
         _write_index(folder, capture, names, val)
     if log is not None:
         log(
@@ -64,16 +64,6 @@ def import_capture(
         )
         _log_remarks(capture, renamed, log)
         log(f"{target} is finished: next run {command('check', target)}")
-
-
-def _held_out(
-    capture: Capture, by_camera: Mapping[int, Sequence[str]], holdout: int | None, ids: Collection[int]
-) -> list[str]:
-    """The frames to evaluate on; the last two arguments are those of ``import_capture``."""
-    if holdout is None and not ids:
-        return list(capture.val)
-    others = [name for i, frames in by_camera.items() if i not in ids for name in frames]
-    return writer.held_out_cameras(by_camera, ids) + writer.held_out(others, holdout or 0)
 
 
 def _with_plain_ids(capture: Capture) -> tuple[Capture, list[tuple[str, str]]]:

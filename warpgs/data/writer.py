@@ -176,22 +176,23 @@ def held_out(names: Sequence[str], holdout: int) -> list[str]:
     return list(names[holdout // 2 :: holdout]) if holdout else []
 
 
-def held_out_cameras(by_camera: Mapping[int, Sequence[str]], ids: Collection[int]) -> list[str]:
-    """The frames kept for evaluation: all of some cameras.
+def held_out_of(by_camera: Mapping[int, Sequence[str]], holdout: int, ids: Collection[int]) -> list[str]:
+    """The frames kept for evaluation: all of some cameras, and every N-th of each other one.
 
     Args:
-        by_camera: Frames of each camera, as of ``Capture.by_camera``.
-        ids: Ids of the cameras; none if empty.
+        by_camera: Frames of each camera, in time, as of ``Capture.by_camera``.
+        holdout: N; 0 for none.
+        ids: Ids of the cameras that are held out as a whole.
 
     Raises:
-        ValueError: If there is no such camera, or no other one.
+        ValueError: As ``held_out``; or if there is no such camera, or no other one.
     """
     for i in ids:
         if i not in by_camera:
             raise ValueError(f"--holdout-camera {i}: there are only the cameras {', '.join(map(str, by_camera))}")
     if ids and {*ids} == {*by_camera}:
         raise ValueError(f"--holdout-camera {' '.join(map(str, ids))} leaves no camera to train on")
-    return [name for i, names in by_camera.items() if i in ids for name in names]
+    return [name for i, names in by_camera.items() for name in (names if i in ids else held_out(names, holdout))]
 
 
 def check_holdout(holdout: int) -> None:

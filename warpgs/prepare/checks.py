@@ -43,7 +43,7 @@ def check_options(sources: Sequence[Path], root: Path, options: Options) -> None
         )
     if options.has_panoramas:
         _check_panoramas(sources, options)
-    check_holdout(options.holdout)
+    _check_evaluation(sources, options)
     if options.masks not in MASKERS and not Path(options.masks).is_dir():
         close = suggestion(options.masks, MASKERS) or similar_path(Path(options.masks))
         raise ValueError(
@@ -58,6 +58,34 @@ def check_options(sources: Sequence[Path], root: Path, options: Options) -> None
         )
     _check_networks(options)
     _check_paths(sources, root, options)
+
+
+def _check_evaluation(sources: Sequence[Path], options: Options) -> None:
+    check_holdout(options.holdout)
+    if len({*find_videos([*map(str, sources)], options.holdout_camera)}) == len(sources):
+        raise ValueError(f"--holdout-camera {' '.join(options.holdout_camera)} leaves no camera to train on")
+
+
+def find_videos(sources: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Indices of the videos of these names: paths, names of files, or these without their ending.
+
+    Args:
+        sources: Paths of all videos.
+        names: As ``Options.holdout_camera``.
+
+    Raises:
+        ValueError: If a name is of no video, or of several.
+    """
+    found = []
+    for name in names:
+        fitting = [k for k, source in enumerate(sources) if name in (source, Path(source).name, Path(source).stem)]
+        if not fitting:
+            raise ValueError(not_one_of("--holdout-camera", name, (Path(source).name for source in sources)))
+        if len(fitting) > 1:
+            paths = " or ".join(sources[k] for k in fitting)
+            raise ValueError(f"--holdout-camera {name} may be {paths}: give its path")
+        found += fitting
+    return found
 
 
 def _check_panoramas(sources: Sequence[Path], options: Options) -> None:
@@ -120,7 +148,8 @@ def check_frames(videos: Sequence[Frames], options: Options) -> None:
         options.focal is not None or options.intrinsics is not None
     ):
         raise ValueError("--focal and --intrinsics are of all videos, which have several sizes: omit them")
-    for video in videos:
+    held_out_videos = find_videos([video.source for video in videos], options.holdout_camera)
+    for k, video in enumerate(videos):
         if options.has_panoramas and abs(video.width - 2 * video.height) > 2:
             raise ValueError(
                 f"--lens EQUIRECTANGULAR needs frames twice as wide as high, those of {video.source} are "
@@ -132,4 +161,5 @@ def check_frames(videos: Sequence[Frames], options: Options) -> None:
                 f"{count} frames{whose} are too few to find what moves, at least {MIN_FOR_MOTION} are needed: take "
                 "more (--fps, --count), or give masks of what moves (--masks FOLDER, --masks none if nothing does)"
             )
-        held_out([""] * count, options.holdout)
+        if k not in held_out_videos:
+            held_out([""] * count, options.holdout)

@@ -98,7 +98,7 @@ class Journal:
             ) from error
         if state.get("version") != VERSION and FINISHED not in done:
             return {}, []  # the intermediate files of an earlier version differ
-        begun = {"camera": "moving", **begun}  # the only one before there was the option
+        begun = {"camera": "moving", "holdout_camera": [], **begun}  # as it was before there were these options
         before, now = _flat(begun), _flat(self._options)
         changed = [f"{key} {before.get(key)}, now {now[key]}" for key in now if before.get(key) != now[key]]
         if changed and "capture" in done:

@@ -57,6 +57,8 @@ class Options:
     pixels, by a network) or none."""
     holdout: int = 0
     """Keep every N-th frame of each camera for evaluation (val_ids); 0 keeps none."""
+    holdout_camera: Annotated[tuple[str, ...], tyro.conf.arg(metavar="VIDEO …")] = ()
+    """Keep all frames of these of several videos for evaluation, and of the others those of --holdout or none."""
     weights: Path | None = None
     """Folder with the networks' weights; by default the Hugging Face cache. Nothing is downloaded."""
     offset: str | None = None

@@ -11,7 +11,7 @@ from warpgs.files import kept_if_used, read_json
 from warpgs.locks import lock_folder
 
 from .cameras.recovered import MISLED, Cameras, NoCamerasError
-from .checks import check_options
+from .checks import check_options, find_videos
 from .doubts import DOUBTFUL_FRACTION
 from .journal import Journal, first_lost
 from .masks.files import Masks
@@ -87,7 +87,8 @@ def _require_whole(root: Path) -> None:
 
 def _run_steps(sources: list[Path], options: Options, journal: Journal) -> None:
     """The algorithm of docs/prepare.md. Finished steps are skipped and their results read from the work folder."""
-    steps, masks = Steps(take(sources, options, journal), options, journal), Masks()
+    held_out = find_videos([*map(str, sources)], options.holdout_camera)
+    steps, masks = Steps(take(sources, options, journal), options, journal, held_out), Masks()
     if MASKERS.get(options.masks) is not None:
         first = steps.recover_background("cameras, first pass")
         masks = steps.find_masks("masks", first)

@@ -43,7 +43,7 @@ def write_capture(
     masks: Callable[[Cameras], Masks],
     *,
     estimated: bool,
-    holdout: int,
+    val: Collection[str],
     quiet: bool = True,
 ) -> tuple[str, list[str]]:
     """Writes the capture, and the contact sheet masks.png; returns a summary, and notes for the user.
@@ -54,17 +54,15 @@ def write_capture(
         cameras: The frames of each camera that were registered.
         masks: Gives the [H, W] dynamic mask of each frame of a camera.
         estimated: Whether the masks are estimates.
-        holdout: Every N-th frame is for evaluation; 0 for none.
+        val: Names of the frames for evaluation.
         quiet: Whether to show no progress.
 
     Raises:
-        ValueError: If too few static points remain, or no frame for evaluation.
+        ValueError: If too few static points remain.
         OSError: If a file cannot be written; the message names it.
     """
     notes = [NO_PARALLAX] if len(cameras) == 1 and not cameras[0].have_parallax else []
     points = _static_points(cameras, masks)
-    for camera in cameras:
-        writer.held_out(camera.names, holdout)  # fails before anything is written
     if omitted := _omitted(videos, cameras):
         notes.append(f"omitted, because no camera was found for them: {few_of(omitted)}")
     sheets = []
@@ -73,7 +71,7 @@ def write_capture(
         shown = write_frames(root, videos[0].folder, camera, dynamic, chosen, quiet)
         sheets.append(_painted(camera.names, shown, dynamic))
     times = {frame.name: frame.time for video in videos for frame in video.taken}
-    write_scene(root, cameras, points, times, holdout, estimated)
+    write_scene(root, cameras, points, times, val, estimated)
     write_contact_sheet(root / "masks.png", sheets)
     return f"{len(times) - len(omitted)} frames, {len(omitted)} omitted, {len(points)} static points", notes
 
@@ -181,7 +179,7 @@ def write_scene(
     cameras: Sequence[Cameras],
     points: Float[np.ndarray, "P 3"],
     times: dict[str, int],
-    holdout: int,
+    val: Collection[str] = (),
     estimated_masks: bool = False,
 ) -> None:
     """Writes points.npy, scene.json, metadata.json, and finally dataset.json, which makes the folder a capture.
@@ -191,7 +189,7 @@ def write_scene(
         cameras: The frames of each camera.
         points: [P, 3] static points in the world.
         times: Time of each frame, see ``SourceFrame``.
-        holdout: Every N-th frame of each camera is for evaluation; 0 for none.
+        val: Names of the frames for evaluation.
         estimated_masks: Whether the masks are estimates.
 
     Raises:
@@ -201,7 +199,6 @@ def write_scene(
     first = min(times[camera.names[0]] for camera in cameras)
     time_ids = {name: times[name] - first for camera in cameras for name in camera.names}
     camera_ids = {name: k for k, camera in enumerate(cameras) for name in camera.names}
-    val = {name for camera in cameras for name in writer.held_out(camera.names, holdout)}
     writer.write_index(root, time_ids, val, camera_ids, estimated_masks=estimated_masks)
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from warpgs.data.lens import Lens
+from warpgs.data.writer import held_out_of
 
 from .cameras.intrinsics import read_intrinsics
 from .cameras.panorama import views_of
@@ -114,11 +115,19 @@ def _take(sources: Sequence[Path], folder: Path, options: Options, journal: Jour
 
 @dataclass(frozen=True)
 class Steps:
-    """The steps after the frames are taken."""
+    """The steps after the frames are taken.
+
+    Attributes:
+        videos: The frames of each camera.
+        options: How to make the capture.
+        journal: Runs each step once.
+        held_out: Indices of the cameras that are for evaluation as a whole.
+    """
 
     videos: list[Frames]
     options: Options
     journal: Journal
+    held_out: Sequence[int] = ()
 
     @property
     def names(self) -> Names:
@@ -278,15 +287,14 @@ class Steps:
 
         def make() -> str:
             self._require_space(IMAGE_BYTES)
-            root, holdout, quiet = self.journal.root, self.options.holdout, self.journal.quiet
             summary, notes = write_capture(
-                root,
+                self.journal.root,
                 self.videos,
                 cameras,
                 masks.read_dynamic,
                 estimated=masks.estimated,
-                holdout=holdout,
-                quiet=quiet,
+                val=held_out_of(dict(enumerate(names_of(cameras))), self.options.holdout, self.held_out),
+                quiet=self.journal.quiet,
             )
             self.journal.notes += notes
             for video, camera in zip(self.videos, cameras, strict=True):
