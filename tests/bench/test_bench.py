@@ -29,7 +29,8 @@ OPTIONS = Bench(device="cpu", repeats=REPEATS)
 
 def report(tmp_path, **options):
     path = tmp_path / "report.json"
-    bench(dataclasses.replace(OPTIONS, json=path, **options), [TINY], "cpu")
+    options = dataclasses.replace(OPTIONS, json=path, **options)
+    bench(options, [TINY.views(options.branches, "cpu", options.sh_degree)], "cpu")
     return json.loads(path.read_text())
 
 
@@ -48,15 +49,48 @@ def test_the_report_has_total_times_and_times_of_all_stages(tmp_path):
 
 def test_compared_steps_alternate():
     calls = []
-    times = time_in_turn({name: functools.partial(calls.append, name) for name in "ab"}, "cpu", REPEATS)
-    assert calls == [*"ab", *"ab", *"ab"]  # the first warms up
+    times = time_in_turn({name: [functools.partial(calls.append, name + k) for k in "12"] for name in "ab"}, "cpu", 2)
+    assert calls == ["a1", "b1", "a2", "b2"] * 3  # the first turn warms up
     assert set(times) == {"a", "b"}
+
+
+def test_the_time_of_several_cameras_is_the_median_of_their_medians(monkeypatch):
+    samples = iter([1.0, 50.0, 3.0, 2.0, 5.0, 4.0, 1.0, 40.0, 3.0])  # of three cameras in turn
+    monkeypatch.setattr(measure, "milliseconds", lambda step, device: next(samples))
+    assert time_in_turn({"a": [lambda: None] * 3}, "cpu", 3) == {"a": 3.0}
+
+
+def test_warm_ups_are_shared_between_cameras():
+    assert [measure.warm_ups("cuda", cameras) for cameras in (1, 5, 7)] == [50, 10, 8]
+    assert measure.warm_ups("cpu", 5) == 1
+
+
+def test_the_tail_has_quantiles_of_tiles_and_the_share_of_the_fullest():
+    lengths = torch.ones(200, dtype=torch.int32)
+    lengths[[3, 77]] = torch.tensor([60, 42], dtype=torch.int32)  # of 300 in sum
+    assert measure.tail(lengths) == {
+        "median": 1,
+        "99_percent": 42,
+        "maximum": 60,
+        "share_of_fullest_1_percent": pytest.approx(102 / 300),
+    }
+
+
+def test_the_tail_of_an_empty_image_is_zero():
+    assert set(measure.tail(torch.zeros(6, dtype=torch.int32)).values()) == {0}
+
+
+def test_differences_from_another_renderer_are_the_largest_of_all_cameras():
+    first = {"max_image": 0.5, "relative_gradients": {"means": 0.1, "sh": 0.4}}
+    second = {"max_image": 0.2, "relative_gradients": {"means": 0.3, "sh": 0.2}}
+    assert measure.worst([first, second]) == {"max_image": 0.5, "relative_gradients": {"means": 0.3, "sh": 0.4}}
 
 
 def test_the_report_counts_gaussians_and_intersections(tmp_path):
     (result,) = report(tmp_path)["results"]
     assert result["num_gaussians"] == TINY.num_gaussians
     assert result["intersections"] > 0
+    assert 0 < result["intersections_per_tile"]["median"] <= result["intersections_per_tile"]["maximum"]
 
 
 @pytest.mark.parametrize("branches", ["random", "disc"])
@@ -73,7 +107,7 @@ def test_depth_can_be_measured_with_branches(tmp_path):
 
 def test_the_profile_is_a_trace_of_forward_and_backward_kernels(tmp_path):
     path = tmp_path / "trace.json"
-    bench(dataclasses.replace(OPTIONS, profile=path), [TINY], "cpu")
+    bench(dataclasses.replace(OPTIONS, profile=path), [TINY.views("none", "cpu")], "cpu")
     events = json.loads(path.read_text())["traceEvents"]
     kernels = [event for event in events if event["ph"] == "X"]
     names = {kernel["name"] for kernel in kernels}
@@ -82,7 +116,7 @@ def test_the_profile_is_a_trace_of_forward_and_backward_kernels(tmp_path):
 
 
 def test_the_output_is_plain_text_if_it_is_not_a_terminal(capsys):
-    bench(OPTIONS, [TINY], "cpu")
+    bench(OPTIONS, [TINY.views("none", "cpu")], "cpu")
     output = capsys.readouterr().out
     assert "tiny: 48x32, 100 Gaussians" in output
     assert "forward [ms]" in output
@@ -90,7 +124,7 @@ def test_the_output_is_plain_text_if_it_is_not_a_terminal(capsys):
 
 
 def test_the_output_has_names_and_no_keys(capsys):
-    bench(dataclasses.replace(OPTIONS, branches="disc"), [TINY], "cpu")
+    bench(dataclasses.replace(OPTIONS, branches="disc"), [TINY.views("disc", "cpu")], "cpu")
     output = capsys.readouterr().out
     for name in ("CPU: ", "forward and backward [ms]", "pass [ms]: composite, backward", "SSIM, forward and backward"):
         assert name in output
@@ -103,7 +137,7 @@ def test_graphs_are_measured_beside_plain_calls(monkeypatch):
     monkeypatch.setattr(torch.cuda, "make_graphed_callables", lambda render, _parameters: render)
     monkeypatch.setattr(measure, "capture", lambda step: step)
     workload = tiny_workload()
-    times = measure.time_passes({"one_image": workload}, ["one_image"], "cpu", repeats=1)
+    times = measure.time_passes({"one_image": [workload]}, ["one_image"], "cpu", repeats=1)
     passes = ("forward", "forward_backward", "callable_forward_backward", "graph_forward_backward")
     assert list(times) == [("one_image", f"{name}_ms") for name in passes]
     assert all(ms > 0 for ms in times.values())
@@ -119,7 +153,7 @@ def test_graphs_are_captured_after_plain_calls_are_measured(monkeypatch):
     )
     monkeypatch.setattr(measure, "capture", lambda step: order.append("graph") or step)
     monkeypatch.setattr(measure, "milliseconds", lambda step, device: order.append("call") or 1.0)
-    measure.time_passes({"one_image": tiny_workload()}, ["one_image"], "cpu", repeats=1)
+    measure.time_passes({"one_image": [tiny_workload()]}, ["one_image"], "cpu", repeats=1)
     assert order == ["call", "call", "graph", "call", "graph", "call"]
 
 
@@ -136,18 +170,22 @@ def test_spherical_harmonics_of_any_degree_can_be_measured(degree, tmp_path, cap
     assert v_sh[:, -1].any()
 
 
-@pytest.mark.parametrize(("sh_degree", "channels"), [(None, (3,)), (2, (9, 3))])
-def test_gsplat_gets_colours_or_harmonics_of_the_same_degree(monkeypatch, sh_degree, channels):
+@pytest.mark.parametrize(
+    ("sh_degree", "channels", "antialias", "mode"),
+    [(None, (3,), False, "classic"), (2, (9, 3), True, "antialiased")],
+)
+def test_gsplat_gets_the_same_colours_and_the_same_antialiasing(monkeypatch, sh_degree, channels, antialias, mode):
     calls = []
 
     def rasterization(*args, **options):
-        calls.append((args[4].shape[1:], options["sh_degree"]))
+        calls.append((args[4].shape[1:], options["sh_degree"], options["rasterize_mode"]))
         return torch.zeros(1, 32, 48, 3), None, None
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
     workload = tiny_workload(sh_degree)
-    (image,) = OTHERS["gsplat"](workload, TINY.make("none", "cpu")[1], False).render()
-    assert calls == [(channels, sh_degree)]
+    settings = RenderSettings(antialias=antialias)
+    (image,) = OTHERS["gsplat"](workload, TINY.make("none", "cpu")[1], settings).render()
+    assert calls == [(channels, sh_degree, mode)]
     assert image.shape == workload.render()[0].shape
 
 
@@ -174,6 +212,10 @@ def tiny_workload(sh_degree=None):
         (["--repeats", "0"], "--repeats must be at least 1"),
         (["--json", "missing/report.json"], "no such folder"),
         (["--profile", "."], "it is a folder"),
+        (["--sizes", "32x24"], "--sizes is for --scene"),
+        (["--scene", "missing.ply"], "--scene missing.ply: no such file or folder"),
+        (["--scene", ".", "--sizes", "32"], "--sizes must be WIDTHxHEIGHT"),
+        (["--scene", ".", "--branches", "disc"], "--branches and --sh-degree are for random scenes"),
     ],
     ids=str,
 )

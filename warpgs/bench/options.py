@@ -2,16 +2,24 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Measures rendering times on random scenes: medians in milliseconds, in total and per stage."""
+    """Measures rendering times of random or trained scenes: medians in milliseconds, in total and per stage."""
 
     scenes: tuple[Literal["small", "large", "wide"], ...] = ()
     """Scenes to measure: small (480x270, 100k Gaussians of 3 px), large (1920x1080, 1M of 4 px), wide (1920x1080, 200k
-    of 20 px). By default all on CUDA and small on CPU."""
+    of 20 px). By default, without --scene, all on CUDA and small on CPU."""
+    scene: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = ()
+    """Trained scene to measure: a run folder, through five of its training cameras; or a file of Gaussians (.ply, .sog,
+    .spz, .glb, .splat), through five cameras on a circle around it. Medians are over the cameras, too. May be repeated.
+    """
+    sizes: tuple[str, ...] = ()
+    """Image sizes of --scene, as WIDTHxHEIGHT; by default 480x270, on CUDA also 1920x1080 and 3840x2160."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to render on; CUDA by default if there is a GPU."""
     repeats: int = 30

@@ -94,7 +94,9 @@ def print_result(result: dict[str, Any]) -> None:
     )
     if result["sh_degree"] is not None:
         title += f", spherical harmonics of degree {result['sh_degree']}"
-    table = _titled(console, title)
+    if result["cameras"] > 1:
+        title += f", {result['cameras']} cameras"
+    table = _titled(console, f"{title}\n{_tail(result['intersections_per_tile'])}")
     table.add_column("")
     for name in names:
         table.add_column(_label(name), justify="right")
@@ -122,6 +124,14 @@ def trace_events(scene: str, kernels: Iterable[KernelTime], process: int) -> lis
         title,
         *({"name": k.name, "ph": "X", "ts": k.start_ms * 1e3, "dur": k.duration_ms * 1e3, **common} for k in kernels),
     ]
+
+
+def _tail(tiles: dict[str, Any]) -> str:
+    """How intersections spread over tiles, in one line."""
+    return (
+        f"intersections per tile: median {tiles['median']:,}, 99 % {tiles['99_percent']:,}, maximum "
+        f"{tiles['maximum']:,}; the fullest 1 % of tiles have {tiles['share_of_fullest_1_percent']:.1%} of them"
+    )
 
 
 def _console() -> Console:

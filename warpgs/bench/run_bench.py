@@ -2,19 +2,24 @@
 
 import dataclasses
 import importlib.util
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import torch
 
+from warpgs.command_line.parsing import parse_size
 from warpgs.files import write_json
 from warpgs.ops.tiles import reset_budgets
 
 from .measure import Measurements, measure
 from .options import Bench
 from .report import machine, print_machine, print_result, trace_events
-from .scenes import SCENES, Scene
+from .scenes import SCENES, Views
+from .trained_scenes import trained_views
 from .training import bench_fps, bench_steps
+
+SIZES = ("480x270", "1920x1080", "3840x2160")
+"""Image sizes of trained scenes."""
 
 
 def run_bench(options: Bench) -> list[Path]:
@@ -30,8 +35,24 @@ def run_bench(options: Bench) -> list[Path]:
     check(options)
     if options.steps or options.fps is not None:
         return bench_training(options, device)
-    names: Sequence[str] = options.scenes or (tuple(SCENES) if device == "cuda" else ("small",))
-    return bench(options, [SCENES[name] for name in names], device)
+    return bench(options, scenes_of(options, device), device)
+
+
+def scenes_of(options: Bench, device: str) -> Iterator[Views]:
+    """The scenes that the options ask for, made one after the other."""
+    names: Sequence[str] = options.scenes
+    if not names and not options.scene:
+        names = tuple(SCENES) if device == "cuda" else ("small",)
+    for name in names:
+        yield SCENES[name].views(options.branches, device, options.sh_degree)
+    for path in options.scene:
+        yield from trained_views(path, sizes_of(options), device)
+
+
+def sizes_of(options: Bench) -> list[tuple[int, int]]:
+    """(width, height) of the images of trained scenes; raises ValueError as ``parse_size``."""
+    texts = options.sizes or (SIZES if options.device == "cuda" else SIZES[:1])
+    return [parse_size("--sizes", text) for text in texts]
 
 
 def check(options: Bench) -> None:
@@ -45,6 +66,7 @@ def check(options: Bench) -> None:
         raise ValueError(f"--repeats must be at least 1, got {options.repeats}")
     if options.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda needs a CUDA GPU, found none")
+    check_scenes(options)
     for option, given in (("--graph", options.graph), (f"--against {options.against}", options.against)):
         if given and options.device != "cuda":
             raise ValueError(f"{option} needs --device cuda")
@@ -57,7 +79,19 @@ def check(options: Bench) -> None:
             raise ValueError(f"cannot write {path}: it is a folder")
 
 
-def bench(options: Bench, scenes: Iterable[Scene], device: str) -> list[Path]:
+def check_scenes(options: Bench) -> None:
+    """Checks the options of random and of trained scenes; raises ValueError as ``check``."""
+    _ = sizes_of(options)
+    if options.sizes and not options.scene:
+        raise ValueError("--sizes is for --scene")
+    if options.scene and (options.branches != "none" or options.sh_degree is not None):
+        raise ValueError("--branches and --sh-degree are for random scenes: omit --scene")
+    for path in options.scene:
+        if not path.exists():
+            raise ValueError(f"--scene {path}: no such file or folder")
+
+
+def bench(options: Bench, scenes: Iterable[Views], device: str) -> list[Path]:
     """Measures scenes, prints the results and writes the files of ``--json`` and ``--profile``; returns their paths."""
     head = machine(device)
     print_machine(head)

@@ -1,4 +1,4 @@
-"""Random scenes for measurements."""
+"""Scenes for measurements: several views of each. Random ones."""
 
 import dataclasses
 import math
@@ -21,6 +21,23 @@ SH_NOISE = 0.1
 
 DISC_AREA = 0.2
 """Fraction of the image area that the disc of dynamic Gaussians covers."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """A scene from one or more cameras with images of one size.
+
+    Attributes:
+        name: Of the scene.
+        splats: Of each camera: at its time.
+        cameras: The cameras.
+        antialias: Whether opacities compensate for the low-pass filter (Mip-Splatting).
+    """
+
+    name: str
+    splats: list[Splats]
+    cameras: list[Camera]
+    antialias: bool = False
 
 
 @dataclass(frozen=True)
@@ -53,6 +70,11 @@ class Scene:
         if branches == "disc":
             splats = dataclasses.replace(splats, is_dynamic=in_disc(splats.means, camera))
         return splats.to(device), camera.to(device)
+
+    def views(self, branches: Branches, device: str, sh_degree: int | None = None) -> Views:
+        """As of ``make``."""
+        splats, camera = self.make(branches, device, sh_degree)
+        return Views(self.name, [splats], [camera])
 
 
 SCENES = {

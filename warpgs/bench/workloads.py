@@ -79,12 +79,17 @@ def make_workload(splats: Splats, camera: Camera, settings: RenderSettings) -> W
     return Workload(run, tuple(getattr(splats, name) for name in names), names, v_images)
 
 
-def make_gsplat_workload(ours: Workload, camera: Camera, depth: bool) -> Workload:
+def make_gsplat_workload(ours: Workload, camera: Camera, settings: RenderSettings) -> Workload:
     """The render of ``ours`` by gsplat."""
     from gsplat import rasterization
 
-    views, intrinsics = camera.viewmat[None], camera.K[None]
-    options = {"packed": False, "render_mode": "RGB+ED" if depth else "RGB", "sh_degree": sh_degree_of(ours)}
+    views, intrinsics, depth = camera.viewmat[None], camera.K[None], settings.depth
+    options = {
+        "packed": False,
+        "render_mode": "RGB+ED" if depth else "RGB",
+        "rasterize_mode": "antialiased" if settings.antialias else "classic",
+        "sh_degree": sh_degree_of(ours),
+    }
 
     def run() -> tuple[Tensor, ...]:
         images, _, _ = rasterization(*ours.parameters, views, intrinsics, *camera.size, **options)
@@ -98,7 +103,7 @@ def sh_degree_of(workload: Workload) -> int | None:
     return degree_of(workload.parameters[-1].shape[1]) if workload.names[-1] == "sh" else None
 
 
-def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workload:
+def make_gswarp_workload(ours: Workload, camera: Camera, settings: RenderSettings) -> Workload:
     """The render of ``ours`` by gswarp, called as the rasterizer of 3DGS: near plane at 0.2, alpha at most 0.99."""
     import gswarp
 
@@ -107,7 +112,7 @@ def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
     projection = camera.viewmat.new_zeros(4, 4)  # OpenGL's, without a use of depth; the principal point is the center
     projection[0, 0], projection[1, 1] = 2 * focal_x / width, 2 * focal_y / height
     projection[2, 2] = projection[3, 2] = 1.0
-    settings = gswarp.GaussianRasterizationSettings(
+    rasterization = gswarp.GaussianRasterizationSettings(
         image_height=height,
         image_width=width,
         tanfovx=width / (2 * focal_x),
@@ -119,10 +124,11 @@ def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
         sh_degree=sh_degree_of(ours) or 0,
         campos=camera.viewmat.inverse()[:3, 3].contiguous(),
         prefiltered=False,
+        antialiasing=settings.antialias,
         auto_tune_verbose=False,
     )
-    gswarp.set_compute_depth(depth)
-    rasterizer = gswarp.GaussianRasterizer(settings)  # which expects unit quaternions
+    gswarp.set_compute_depth(settings.depth)
+    rasterizer = gswarp.GaussianRasterizer(rasterization)  # which expects unit quaternions
     offsets = torch.zeros_like(ours.parameters[0], requires_grad=True)
     keyword = "colors_precomp" if ours.names[-1] == "colors" else "shs"
 
@@ -133,7 +139,7 @@ def make_gswarp_workload(ours: Workload, camera: Camera, depth: bool) -> Workloa
         )
         image = image.movedim(0, -1)
         # Its depth is a sum; that of the others is divided by alpha.
-        return (image, meta.depth[0] / meta.alpha[0].clamp_min(1e-10)) if depth else (image,)
+        return (image, meta.depth[0] / meta.alpha[0].clamp_min(1e-10)) if settings.depth else (image,)
 
     return dataclasses.replace(ours, render=run)
 

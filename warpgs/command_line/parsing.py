@@ -29,7 +29,23 @@ Options = TypeVar("Options")
 RunFolder = Annotated[Path, tyro.conf.arg(name="run", metavar="RUN"), tyro.conf.Positional]
 """A positional argument: the folder of a run."""
 
+MAX_SIDE = 16_384
+"""Maximum width and height of an image [px]."""
+
 METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "NAME", Path: "PATH"}
+
+
+def parse_size(option: str, text: str) -> tuple[int, int]:
+    """(width, height) of the value of an option [px].
+
+    Raises:
+        ValueError: If it does not have the form WIDTHxHEIGHT, or is out of range; the message names the option.
+    """
+    numbers = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
+    width, height = (int(number) for number in numbers.groups()) if numbers else (0, 0)
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise ValueError(f"{option} must be WIDTHxHEIGHT with sides of 1 to {MAX_SIDE:,} pixels, got {text!r}")
+    return width, height
 
 
 def _choices(match: re.Match[str]) -> str:

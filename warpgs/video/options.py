@@ -1,19 +1,15 @@
 """Options of ``warpgs render``."""
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-from warpgs.command_line.parsing import RunFolder
+from warpgs.command_line.parsing import RunFolder, parse_size
 from warpgs.editing.options import Editing
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
-
-MAX_SIDE = 16_384
-"""Maximum width and height of ``--size`` [px]."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +72,7 @@ class Render:
         Raises:
             ValueError: If it does not have the form WIDTHxHEIGHT, or is out of range.
         """
-        numbers = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", self.size or "")
-        width, height = (int(number) for number in numbers.groups()) if numbers else (0, 0)
-        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise ValueError(f"--size must be WIDTHxHEIGHT with sides of 1 to {MAX_SIDE:,} pixels, got {self.size!r}")
-        return width, height
+        return parse_size("--size", self.size or "")
 
     @property
     def path_name(self) -> str:
