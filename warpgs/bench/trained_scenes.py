@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -14,7 +15,7 @@ from warpgs.ops.sh import num_bases
 from warpgs.runs.opening import open_scene
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
-from warpgs.video.camera_paths import BoundingSphere, default_camera, evenly_spaced, filling
+from warpgs.video.camera_paths import DEFAULT_FOCAL, DEFAULT_SIZE, UP, BoundingSphere, evenly_spaced, filling
 
 from .scenes import Views
 
@@ -23,6 +24,9 @@ NUM_CAMERAS = 5
 DISTANCE = 1.25
 """Distance of the cameras on a circle from the center of the scene, in radii of the scene, which then fills the image;
 the radius contains 98 % of its Gaussians."""
+
+ELEVATION = math.radians(20.0)
+"""Angle at which they look down [rad]."""
 
 
 def trained_views(path: Path, sizes: Sequence[tuple[int, int]], device: str) -> Iterator[Views]:
@@ -46,12 +50,15 @@ def trained_views(path: Path, sizes: Sequence[tuple[int, int]], device: str) -> 
 
 
 def circle(means: Float[Tensor, "N 3"]) -> list[Camera]:
-    """Cameras on a horizontal circle around most of a scene that look at its middle, at evenly spaced times."""
-    sphere = BoundingSphere.around(means)
-    angles = [2.0 * math.pi * k / NUM_CAMERAS for k in range(NUM_CAMERAS)]
-    sides = [(math.sin(angle), -math.cos(angle)) for angle in angles]
-    times = evenly_spaced(NUM_CAMERAS)
-    return [default_camera(sphere, side, time, DISTANCE) for side, time in zip(sides, times, strict=True)]
+    """Cameras on a horizontal circle above most of a scene that look at its middle, at evenly spaced times."""
+    sphere, cameras = BoundingSphere.around(means), []
+    for k, time in enumerate(evenly_spaced(NUM_CAMERAS)):
+        angle = 2.0 * math.pi * k / NUM_CAMERAS
+        across, down = math.cos(ELEVATION), -math.sin(ELEVATION)
+        side = torch.tensor([across * math.sin(angle), down, -across * math.cos(angle)], dtype=torch.float32)
+        position, focal = sphere.center + DISTANCE * sphere.radius * side, DEFAULT_FOCAL * DEFAULT_SIZE[1]
+        cameras.append(Camera.looking_at(position, sphere.center, UP, focal, DEFAULT_SIZE, time))
+    return cameras
 
 
 def _training_cameras(run: Run) -> list[Camera]:

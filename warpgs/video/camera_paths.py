@@ -109,17 +109,14 @@ def upward(capture: Capture) -> Float[Tensor, "3"]:
     return up if float(up.norm()) > 1e-3 else torch.tensor(UP, dtype=torch.float32)
 
 
-def default_camera(
-    sphere: BoundingSphere,
-    side: tuple[float, float] = (0.0, -1.0),
-    time: float = 0.0,
-    distance: float = DEFAULT_DISTANCE,
-) -> Camera:
+def default_camera(sphere: BoundingSphere, side: tuple[float, float] = (0.0, -1.0), time: float = 0.0) -> Camera:
     """A camera that sees most of a scene, with y pointing down.
 
-    The direction from the center of the scene to the camera has ``side`` as its x and z; its distance is in radii.
+    The direction from the center of the scene to the camera has ``side`` as its x and z.
     """
-    position = sphere.center + distance * sphere.radius * torch.tensor([side[0], 0.0, side[1]], dtype=torch.float32)
+    position = sphere.center + DEFAULT_DISTANCE * sphere.radius * torch.tensor(
+        [side[0], 0.0, side[1]], dtype=torch.float32
+    )
     focal = DEFAULT_FOCAL * DEFAULT_SIZE[1]
     return Camera.looking_at(position, sphere.center, torch.tensor(UP, dtype=torch.float32), focal, DEFAULT_SIZE, time)
 
