@@ -257,10 +257,10 @@ def test_steps_of_both_stages_are_measured(preset):
     assert measured["3dgs_ms"] > 0
 
 
-def test_a_plain_step_has_neither_networks_nor_depth():
+def test_a_plain_step_compares_the_joint_image_alone_without_networks_and_depth():
     protocol = Protocol(PRESETS["paper"], has_depth=True)
     phase = protocol.phase_at(protocol.stage2.start)
-    plain, omitted = plain_phase(phase), ("use_deformation", "use_appearance", "with_depth")
+    plain, omitted = plain_phase(phase), ("use_deformation", "use_appearance", "with_depth", "with_branches")
     assert all(getattr(phase, name) for name in omitted)
     assert not any(getattr(plain, name) for name in omitted)
     assert plain.with_joint

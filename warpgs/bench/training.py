@@ -115,9 +115,7 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
         plan = protocol.at((stage.start + stage.end) // 2)
         result[f"{stage.name}_ms"] = statistics.median(_times(step, plan, device, repeats))
     scene = random_scene(splats, torch.zeros_like(dynamic), config.model).to(device)
-    loss = dataclasses.replace(config.loss, branches_in_stage2="no")
-    plain_config = dataclasses.replace(config, frozen="nothing", loss=loss)
-    step = Step(plain_config, scene, views, alignments, trust, capture.view_size)
+    step = Step(dataclasses.replace(config, frozen="nothing"), scene, views, alignments, trust, capture.view_size)
     plain = dataclasses.replace(plan, phase=plain_phase(plan.phase))
     result["3dgs_ms"] = statistics.median(_times(step, plain, device, repeats))
     if device == "cuda":
@@ -127,7 +125,9 @@ def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeat
 
 def plain_phase(phase: Phase) -> Phase:
     """A phase of stage II without networks and depth, in which the joint image alone is compared: a step of 3DGS."""
-    return dataclasses.replace(phase, use_deformation=False, use_appearance=False, with_depth=False)
+    return dataclasses.replace(
+        phase, use_deformation=False, use_appearance=False, with_depth=False, with_branches=False
+    )
 
 
 def _times(step: Step, plan: IterationPlan, device: str, repeats: int) -> Iterable[float]:
