@@ -17,6 +17,7 @@ from warpgs.initialization.prepare_start import prepare_start
 from warpgs.rendering import Layer, Rendering
 from warpgs.runs import checkpoint
 from warpgs.runs.trained import TrainedScene
+from warpgs.training.losses import only_shown
 from warpgs.training.trainer import Trainer
 
 CONFIG = dataclasses.replace(
@@ -103,3 +104,14 @@ def _values(image: torch.Tensor, capture: Capture) -> dict[str, float | None]:
     )
     (view,) = evaluate(scene, capture, quiet=True).views
     return view.values
+
+
+def test_a_fisheye_view_without_images_of_the_branches_learns_nothing_outside_of_its_circle():
+    shown = torch.arange(3 * 4).reshape(3, 4) % 3 > 0
+    view = SimpleNamespace(shown=shown, image=torch.rand(3, 4, 3))
+    joint = Layer(torch.rand(3, 4, 3), torch.ones(3, 4), None)
+    rendering = Rendering(joint, None, None, torch.zeros(1, 2, dtype=torch.int32), None, None, None)
+    kept = only_shown(rendering, view, torch.zeros(3))
+    assert (kept.static, kept.dynamic) == (None, None)
+    assert torch.equal(kept.joint.image[shown], joint.image[shown])
+    assert torch.equal(kept.joint.image[~shown], view.image[~shown])

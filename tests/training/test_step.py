@@ -9,7 +9,9 @@ import torch
 
 from tests import plain, tiny
 from warpgs.ops.dropout import MAX_SEED
+from warpgs.rendering import render
 from warpgs.runtime import ranks
+from warpgs.training import step
 from warpgs.training.optimizer import GROUPS
 from warpgs.training.sampling import Sampler
 from warpgs.training.schedule import Phase
@@ -155,6 +157,25 @@ def test_each_iteration_and_each_rank_omits_other_gaussians(monkeypatch):
         seeds += [sampler(k, 0, 0.0).dropout_seed for k in range(10)]
     assert len(set(seeds)) == 20
     assert all(0 <= seed < MAX_SEED for seed in seeds)
+
+
+@pytest.mark.parametrize("compared", ["yes", "no"])
+def test_the_images_of_the_branches_are_rendered_where_they_are_compared(data, tmp_path, monkeypatch, compared):
+    loss = dataclasses.replace(tiny.CONFIG.loss, branches_in_stage2=compared)
+    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(tiny.CONFIG, loss=loss))
+    trainer._add_dynamic_gaussians()
+    rendered = []
+
+    def recorded(*arguments):
+        rendered.append(rendering := render(*arguments))
+        return rendering
+
+    monkeypatch.setattr(step, "render", recorded)
+    for stage in (trainer.protocol.stage1, trainer.protocol.stage2):
+        plan = trainer.protocol.at(stage.start)
+        trainer.step(plan, trainer._sample(plan))
+    has_images = [rendering.static is not None and rendering.dynamic is not None for rendering in rendered]
+    assert has_images == [True, compared == "yes"]
 
 
 @pytest.mark.parametrize("hidden_appearance", [True, False])

@@ -92,8 +92,7 @@ def bench_steps(device: str, repeats: int, preset: str) -> list[dict[str, Any]]:
 def measure_steps(num_gaussians: int, size: tuple[int, int], device: str, repeats: int, preset: str) -> dict[str, Any]:
     """Median time [ms] of a step of stage I, of stage II and of 3DGS, and on CUDA the maximum memory of tensors [MB].
 
-    That of 3DGS has no networks, no depth and no dynamic Gaussians, and compares the joint image alone; the static and
-    the dynamic image are rendered, too.
+    A step of 3DGS has no networks, no depth and no dynamic Gaussians, and renders the joint image alone.
     """
     splats, camera = random_splats(num_gaussians, *size, PIXELS * size[0] / MIN_SIZE[0], SEED)
     config = dataclasses.replace(PRESETS[preset], device="cuda" if device == "cuda" else "cpu")

@@ -63,18 +63,17 @@ def only_shown(rendering: Rendering, view: View, background: Float[Tensor, "3"])
     """The rendering with images that are right where the view shows nothing, so that nothing is learned there.
 
     Args:
-        rendering: Of the view, with the images of the branches.
+        rendering: Of the view.
         view: The view, static where it shows nothing.
         background: [3] colour behind the dynamic image.
     """
     if view.shown is None:
         return rendering
-    assert rendering.static is not None
-    assert rendering.dynamic is not None
+    joint, static, dynamic = rendering[:3]
     return rendering._replace(
-        joint=rendering.joint.only_where(view.shown, view.image),
-        static=rendering.static.only_where(view.shown, view.image),
-        dynamic=rendering.dynamic.only_where(view.shown, background),
+        joint=joint.only_where(view.shown, view.image),
+        static=static and static.only_where(view.shown, view.image),
+        dynamic=dynamic and dynamic.only_where(view.shown, background),
     )
 
 

@@ -169,7 +169,8 @@ class Step:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
         backgrounds, offsets = self._backgrounds(), self.density.screen_offsets if phase.densifies else None
-        rendering = render(splats, view.camera, backgrounds, self._settings(phase), offsets)
+        behind = backgrounds if phase.with_branches else backgrounds[0]
+        rendering = render(splats, view.camera, behind, self._settings(phase), offsets)
         rendering = only_shown(rendering, view, backgrounds[2])
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
@@ -217,7 +218,7 @@ class Step:
 
     def _settings(self, phase: Phase) -> RenderSettings:
         """What is rendered in a phase."""
-        settings = replace(self.config.render_settings, branches=True, depth=phase.with_depth)
+        settings = replace(self.config.render_settings, branches=phase.with_branches, depth=phase.with_depth)
         return self.density.settings(settings) if phase.densifies else settings
 
     def _choose_trained(self, phase: Phase) -> None:
