@@ -1,10 +1,12 @@
 """Whether a camera stands still."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from tests.prepare import boards
-from warpgs.prepare.frames.stillness import find_background, require_still, stands_still
+from warpgs.prepare.frames.stillness import BAND, find_background, median, require_still, stands_still
 
 NAMES = [f"shot{k:03d}" for k in range(12)]
 
@@ -28,6 +30,32 @@ def test_the_background_is_what_is_there_most_of_the_time(tmp_path):
     expected = boards.record(2, moves=False, path=boards.still_pose)[0][0]
     assert (np.abs(background.astype(int) - expected).max(-1) > 8).mean() < 0.02
     assert find_background(write(tmp_path / "moving"), NAMES) is None
+
+
+def test_the_median_is_of_what_counts():
+    """An object that rests in most frames is not in it, unless it is always there."""
+    frames = [np.full((2, 3, 3), value, np.uint8) for value in (10, 12, 11, 90, 90, 90, 90)]
+    static = [np.full((2, 3), value) for value in (True, True, True, False, False, False, False)]
+    for mask in static:
+        mask[0, 0] = False
+    found = median(frames, static)
+    assert (found[0, 0] == 90).all()
+    assert (found[1] == 11).all()
+
+
+@pytest.mark.parametrize("count", [1, 6, 7])
+def test_the_median_is_exact_over_several_bands(count):
+    images = np.random.default_rng(0).integers(0, 256, (count, 2 * BAND + 3, 5, 3), dtype=np.uint8)
+    assert np.array_equal(median(list(images)), np.median(images, axis=0).round().astype(np.uint8))
+
+
+def test_the_median_takes_little_more_memory_than_the_images():
+    images = [np.full((540, 320, 3), k, np.uint8) for k in range(31)]
+    static = [np.ones((540, 320), bool)] * 31
+    tracemalloc.start()
+    median(images, static)
+    assert tracemalloc.get_traced_memory()[1] < 0.5 * sum(image.nbytes for image in images)
+    tracemalloc.stop()
 
 
 def test_images_without_texture_do_not_tell(tmp_path):

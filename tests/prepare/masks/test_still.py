@@ -9,7 +9,7 @@ from warpgs.data.lens import Lens
 from warpgs.prepare.cameras.posed_frames import PosedFrames
 from warpgs.prepare.masks.methods import find_moving
 from warpgs.prepare.masks.motion import find_dynamic
-from warpgs.prepare.masks.still import difference, median_where
+from warpgs.prepare.masks.still import Background
 
 SIZE = (256, 192)
 """(width, height) [px]."""
@@ -33,7 +33,7 @@ def record(noise: float = 0.0) -> list[np.ndarray]:
 
 
 def posed(images: list[np.ndarray]) -> PosedFrames:
-    return PosedFrames(images, Lens.centered(230.0, SIZE), np.tile(np.eye(4)[:3], (NUM_FRAMES, 1, 1)), boards.points())
+    return PosedFrames(images, Lens.centered(230.0, SIZE), np.tile(np.eye(4)[:3], (len(images), 1, 1)), boards.points())
 
 
 def mean_overlap(masks) -> float:
@@ -56,21 +56,39 @@ def test_noise_is_not_masked():
 def test_a_shadow_and_a_change_of_exposure_count_only_as_such():
     darker = (WALL * 0.6).astype(np.uint8)
     shadow = np.where(disc(5)[..., None], darker, WALL)
-    differs, is_shadow = difference(shadow, WALL)
+    wall = Background(WALL)
+    differs, is_shadow = wall.difference(shadow)
     assert is_shadow[disc(5)].mean() > 0.9
     near = cv2.dilate(disc(5).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
     assert differs[disc(5)].mean() > 0.8
     assert differs[~near].max() < 0.5
     brighter = np.clip(WALL.astype(int) + 20, 0, 255).astype(np.uint8)
-    assert difference(brighter, WALL)[0].mean() < 0.05
+    assert wall.difference(brighter)[0].mean() < 0.05
+    assert not wall.has_other_texture(shadow).any()
 
 
-def test_the_background_is_the_median_of_what_does_not_move():
-    """An object that rests in most frames is not in it, unless it is always there."""
-    frames = [np.full((2, 3, 3), value, np.uint8) for value in (10, 12, 11, 90, 90, 90, 90)]
-    static = [np.full((2, 3), value) for value in (True, True, True, False, False, False, False)]
-    for mask in static:
-        mask[0, 0] = False
-    background = median_where(frames, static)
-    assert (background[0, 0] == 90).all()
-    assert (background[1] == 11).all()
+def test_a_grey_object_before_a_grey_wall_is_no_shadow():
+    """Its colour is the wall's times a factor, its texture is not."""
+    grey = boards.texture(3, (140, 140, 140), 256, (8, 25))[: SIZE[1]]
+    paint = np.kron(np.random.default_rng(0).integers(60, 121, (48, 64)), np.ones((4, 4)))
+    image = np.where(disc(5), paint, grey[..., 0]).astype(np.uint8)[..., None].repeat(3, 2)
+    background = Background(grey)
+    inner = cv2.erode(disc(5).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    assert background.difference(image)[1][inner].mean() > 0.8
+    other = background.has_other_texture(image)
+    assert other[inner].mean() > 0.9
+    assert other[cv2.dilate(disc(5).astype(np.uint8), np.ones((9, 9), np.uint8)) == 0].mean() < 0.01
+
+
+def test_motion_is_looked_for_in_as_many_frames_of_a_long_video_as_of_a_short_one(monkeypatch):
+    counts = []
+
+    def nothing(frames: PosedFrames, quiet: bool) -> list[np.ndarray]:
+        counts.append(len(frames.images))
+        return [np.zeros(SIZE[::-1], bool) for _ in frames.images]
+
+    monkeypatch.setattr("warpgs.prepare.masks.still.find_dynamic", nothing)
+    masks = find_moving(posed(record() * 3), True)
+    assert counts == [31]
+    assert len(masks) == 3 * NUM_FRAMES
+    assert mean_overlap(masks[NUM_FRAMES : 2 * NUM_FRAMES]) > 0.9

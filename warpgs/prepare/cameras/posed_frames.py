@@ -81,6 +81,11 @@ class PosedFrames:
         images = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in self.images]
         return PosedFrames(images, self.lens.resized(*size), self.poses, self.points, self.focal)
 
+    def chosen(self, frames: Sequence[int]) -> "PosedFrames":
+        """Some of the frames, as if there were no others."""
+        images = [self.images[k] for k in frames]
+        return PosedFrames(images, self.lens, self.poses[frames], self.points, self.focal)
+
     @property
     def stand_still(self) -> bool:
         """Whether all frames have one pose."""

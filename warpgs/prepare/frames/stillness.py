@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from warpgs.data.sampling import evenly_spaced
 
@@ -24,13 +24,18 @@ MIN_LIKELY = 0.25
 NUM_COMPARED, NUM_MEDIAN = 16, 31
 """Number of frames that are compared with the middle one, and that the background is the median of."""
 
-BAND = 64
-"""Rows whose median is computed together."""
+BAND, UNCOUNTED = 16, 256
+"""Rows whose median is computed together, and a level above all others."""
+
+MIN_SEEN = 3
+"""Number of frames that must see a place without motion for these alone to tell its background."""
 
 
 def find_background(folder: Path, names: Sequence[str]) -> UInt8[np.ndarray, "H W 3"] | None:
     """[H, W, 3] the median over time of the frames <folder>/<name>.png; None if the camera moves."""
-    return median(folder, names) if stands_still(folder, names) else None
+    if not stands_still(folder, names):
+        return None
+    return median(list(read_images(folder, evenly_spaced(names, NUM_MEDIAN))))
 
 
 def stands_still(folder: Path, names: Sequence[str]) -> bool:
@@ -69,9 +74,24 @@ def _staying(a: UInt8[np.ndarray, "H W"], b: UInt8[np.ndarray, "H W"], corners: 
     return float(((shifts < MAX_SHIFT) & (found.ravel() > 0)).mean())
 
 
-def median(folder: Path, names: Sequence[str]) -> UInt8[np.ndarray, "H W 3"]:
-    """[H, W, 3] the median over time of some frames, evenly spaced."""
-    images = list(read_images(folder, evenly_spaced(names, NUM_MEDIAN)))
-    rows = range(0, len(images[0]), BAND)
-    bands = [np.median([image[row : row + BAND] for image in images], axis=0) for row in rows]
-    return np.concatenate(bands).round().astype(np.uint8)
+def median(
+    images: Sequence[UInt8[np.ndarray, "H W 3"]], static: Sequence[Bool[np.ndarray, "H W"]] | None = None
+) -> UInt8[np.ndarray, "H W 3"]:
+    """[H, W, 3] the median over time, in bands of rows, so that it takes little more memory than the images.
+
+    Args:
+        images: [H, W, 3] of each frame.
+        static: [H, W] what counts of each; where fewer than ``MIN_SEEN`` frames have something, and if None, all count.
+    """
+    found = np.empty_like(images[0])
+    for row in range(0, len(found), BAND):
+        rows = slice(row, row + BAND)
+        values = np.array([image[rows] for image in images], np.int16)
+        if static is not None:
+            counts = np.array([mask[rows] for mask in static])
+            values[~counts & (counts.sum(0) >= MIN_SEEN)] = UNCOUNTED
+        values.sort(axis=0)
+        count = (values < UNCOUNTED).sum(0, keepdims=True)
+        middle = [np.take_along_axis(values, k, 0)[0] for k in ((count - 1) // 2, count // 2)]
+        found[rows] = (sum(middle) / 2.0).round()
+    return found
