@@ -19,8 +19,8 @@ def inputs(time=0.3):
 
 def studio_inputs(time=0.65):
     size = studio.StudioSize(width=37, height=21)
-    camera = studio._camera(time, 0.1, size)
-    bodies = as_tensors([*studio._static_bodies(), *studio._moving_bodies(time)], CPU)
+    camera = studio.camera_at(time, 0.1, size)
+    bodies = as_tensors([*studio.static_bodies(), *studio.moving_bodies(time)], CPU)
     lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]])
     return bodies, lamp, even_samples(3, CPU), camera.viewmat, camera.K, camera.size
 

@@ -18,6 +18,7 @@ from warpgs.synthetic import studio
 from warpgs.synthetic.degraded_depth import DegradedDepth
 from warpgs.synthetic.folder import builtin_folder
 from warpgs.synthetic.studio import StudioSize, studio_capture, trace
+from warpgs.synthetic.studio_tracks import exact_tracks, with_tracks
 
 SMALL = StudioSize(width=64, height=36, num_frames=4, num_samples=2, num_points=200)
 
@@ -181,3 +182,21 @@ def test_a_size_that_no_built_in_capture_has_is_refused_before_it_is_made(monkey
 def test_a_single_frame_is_refused(tmp_path):
     with pytest.raises(ValueError, match="at least 2 frames, got 1"):
         studio_capture("exact", tmp_path, StudioSize(num_frames=1), quiet=True)
+
+
+def test_names_tell_the_tracks_of_the_studio():
+    assert parse_builtin("builtin:studio?tracks=broken").tracks == "broken"
+    assert parse_builtin("builtin:studio").tracks == "none"
+    with pytest.raises(ValueError, match="there is no built-in capture"):
+        parse_builtin("builtin:studio?tracks=none-at-all")
+
+
+@pytest.mark.parametrize("kind", ["exact", "broken"])
+def test_tracks_are_added_to_a_copy_of_the_studio(cache, kind):
+    exact = studio_capture("exact", cache, SMALL, quiet=True)
+    tracked = load_capture(with_tracks(exact, kind, SMALL, quiet=True))
+    assert load_capture(exact).tracks is None
+    assert tracked.tracks.frames == tuple(f"left_{k:06d}" for k in range(4))
+    expected, visible = exact_tracks(SMALL)
+    errors = np.abs(tracked.tracks.positions * (64, 36) - expected)[visible]
+    assert (np.nanmax(errors) < 1e-3) == (kind == "exact")

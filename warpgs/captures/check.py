@@ -23,6 +23,7 @@ from .masks_check import are_suspect, check_dynamic_depth, check_empty_masks, ch
 from .motion_check import Motion, check_motion, motions_of
 from .opening import load_capture
 from .points_check import check_points
+from .tracks_check import check_tracks
 from .turning_check import check_turning
 
 READ_SECONDS = 15.0
@@ -74,6 +75,7 @@ def _compare(sample: Sample, motions: list[Motion], readable: set[str]) -> list[
         *check_points(capture, names),
         *check_turning(capture, names),
         *check_depth(capture, names),
+        *check_tracks(capture, names),
         *check_motion(motions, capture.conventions.masks),
         *check_agreement(capture, [cameras.of(readable) for cameras in sample.compared]),
     ]

@@ -11,6 +11,7 @@ from warpgs.command_line.progress import progress
 from warpgs.data import writer
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens
+from warpgs.data.tracks import write_tracks
 from warpgs.data.units import SceneUnits, depth_range
 from warpgs.errors import command
 from warpgs.files import complete_or_absent
@@ -122,6 +123,9 @@ def _write_index(folder: Path, capture: Capture, names: list[str], val: list[str
     near, far = depth_range(_depths(capture))
     writer.write_scene(folder, SceneUnits(np.zeros(3), 1.0), points, near, far, colors)
     cameras = {name: capture.cameras[name] for name in names}
+    if (tracks := capture.tracks) is not None:
+        size = capture.cameras[capture.train[0]].size
+        write_tracks(folder, tracks.positions * np.array(size), tracks.visible, size)
     writer.write_index(
         folder,
         {name: camera.time for name, camera in cameras.items()},

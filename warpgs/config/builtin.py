@@ -7,7 +7,7 @@ from warpgs.errors import suggestion
 
 PREFIX = "builtin:"
 
-DEPTHS = ("exact", "network", "none")
+DEPTHS, TRACKS = ("exact", "network", "none"), ("none", "exact", "broken")
 MIN_FRAMES, MAX_FRAMES = 2, 160
 """Number of training frames of ``builtin:studio?frames=N``; as many are the default."""
 
@@ -15,12 +15,13 @@ RIG_FRAMES, MAX_CAMERAS, MAX_OFFSET = 60, 5, 1.0
 """Frames of each camera of ``builtin:rig?frames=N``, training cameras of ``builtin:rig?cameras=N``, and maximum of
 ``builtin:rig?offset=S``, by which the clocks of its cameras differ at most [s]; the first two are the defaults."""
 
-QUERIES = {"studio": ("depth", "frames"), "rig": ("frames", "cameras", "offset")}
+QUERIES = {"studio": ("depth", "frames", "tracks"), "rig": ("frames", "cameras", "offset")}
 """What may follow the names of built-in captures."""
 
 NAMES = (
     *("builtin:room", "builtin:balls", "builtin:rig", "builtin:studio"),
     *(f"builtin:studio?depth={depth}" for depth in DEPTHS),
+    *(f"builtin:studio?tracks={tracks}" for tracks in TRACKS[1:]),
 )
 
 
@@ -38,6 +39,7 @@ class Builtin(NamedTuple):
         num_frames: Number of training frames of the studio, and frames of each camera of the rig.
         num_cameras: Number of training cameras of the rig.
         offset: By how much the clocks of its cameras differ at most [s].
+        tracks: Tracks of the studio.
     """
 
     name: str
@@ -45,6 +47,7 @@ class Builtin(NamedTuple):
     num_frames: int = MAX_FRAMES
     num_cameras: int = MAX_CAMERAS
     offset: float = 0.0
+    tracks: Literal["none", "exact", "broken"] = "none"
 
 
 def parse_builtin(data: Path | str) -> Builtin:
@@ -57,7 +60,8 @@ def parse_builtin(data: Path | str) -> Builtin:
     name, mark, query = given.partition("?")
     options = dict(part.partition("=")[::2] for part in query.split("&")) if mark else {}
     is_known = f"{PREFIX}{name}" in NAMES and {*options} <= {*QUERIES.get(name, ())} and bool(options) == bool(mark)
-    if not is_known or options.get("depth", "exact") not in DEPTHS:
+    is_known &= options.get("depth", "exact") in DEPTHS and options.get("tracks", "none") in TRACKS
+    if not is_known:
         # Without the prefix, which would make all names similar.
         close = suggestion(given, [name.removeprefix(PREFIX) for name in NAMES], f"{PREFIX}{{}}".format)
         raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}{close}")
@@ -68,6 +72,7 @@ def parse_builtin(data: Path | str) -> Builtin:
         _whole(data, options.get("frames", str(most)), MIN_FRAMES, most, "frames"),
         _whole(data, options.get("cameras", str(MAX_CAMERAS)), 1, MAX_CAMERAS, "cameras"),
         _seconds(data, options.get("offset", "0")),
+        cast(Any, options.get("tracks", "none")),
     )
 
 

@@ -20,6 +20,7 @@ from .median_depth import median_depth
 from .read_ahead import ReadAhead
 from .sampling import evenly_spaced
 from .time_source import AS_GIVEN, TimeSource
+from .tracks import Tracks
 
 MIN_PATH = 0.01
 """Radius of the training cameras' positions, relative to the median depth, below which depth cannot be learned: a tenth
@@ -135,6 +136,7 @@ class Capture:
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         conventions: What its files mean.
         is_builtin: Whether the package makes it: then no advice to change its files makes sense.
+        tracks: Points that a network followed through the frames of ``film``; None without any.
         notes: Remarks of the loader on files that it skipped or had to interpret, one sentence each.
         assumption: What is taken as dynamic; see ``assuming``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
@@ -160,6 +162,7 @@ class Capture:
     time_source: TimeSource = AS_GIVEN
     readout: float = 0.0
     layout: str = ""
+    tracks: Tracks | None = None
     conventions: Conventions = field(default_factory=Conventions)
     assumption: Assumption = field(init=False)
     has_empty: bool = field(init=False)
@@ -301,6 +304,12 @@ class Capture:
             is_one = len({self.cameras[name].time for name in frames}) == len(frames)
             found += [frames] if is_one else [[name] for name in frames]
         return found
+
+    @property
+    def film(self) -> list[str] | None:
+        """The frames of the camera that trains, held-out ones among them, in the order of time; None if several do."""
+        trained = [*self.by_camera(self.train)]
+        return self.by_camera(self.cameras)[trained[0]] if len(trained) == 1 else None
 
     def neighbours(self, names: Iterable[str]) -> list[tuple[str, str]]:
         """Pairs of frames of one camera, one after the other in time."""

@@ -15,6 +15,11 @@ MAX_BYTES = 8 << 30
 """Maximum size of an .npz file, and of its arrays together [bytes]."""
 
 
+def names_of(path: Path) -> set[str]:
+    """Names of the arrays of an .npz file; raises ``ValueError`` if it is missing, damaged or too large."""
+    return {member.removesuffix(".npy") for member in Archive(path, MAX_BYTES).sizes}
+
+
 def read_npz(path: Path, names: Collection[str], max_bytes: int = MAX_BYTES) -> dict[str, Shaped[np.ndarray, "..."]]:
     """Arrays of numbers of an .npz file; pickled objects are refused.
 

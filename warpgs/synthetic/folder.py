@@ -34,4 +34,10 @@ def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = N
         return rig_capture(size=size, quiet=quiet)
     from .studio import StudioSize, studio_capture
 
-    return studio_capture(found.depth, size=StudioSize(num_frames=found.num_frames), quiet=quiet)
+    studio_size = StudioSize(num_frames=found.num_frames)
+    folder = studio_capture(found.depth, size=studio_size, quiet=quiet)
+    if found.tracks == "none":
+        return folder
+    from .studio_tracks import with_tracks
+
+    return with_tracks(folder, found.tracks, studio_size, quiet)

@@ -5,6 +5,7 @@ room a mirroring ring tumbles, a glossy body is squashed and changes its lobes, 
 exact, points are noisy, depth is exact, has the errors of a network, or is missing:
 
     builtin:studio    builtin:studio?depth=network    builtin:studio?depth=none    builtin:studio?frames=12
+    builtin:studio?tracks=exact    builtin:studio?tracks=broken
 
 With fewer frames, the camera and all that moves take wider steps along the same paths.
 
@@ -14,6 +15,7 @@ kernels), the rest by computing in double precision before the last rounding.
 
 import math
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -34,7 +36,7 @@ from warpgs.visualize.images import to_bytes
 from .bodies import Body, as_tensors, euler, even_samples
 from .cache import cached, content_folder
 from .degraded_depth import DegradedDepth
-from .raytrace import BLOB, CUBE, SPHERE, TORUS, raytrace
+from .raytrace import BLOB, CUBE, SPHERE, TORUS, TracedImage, raytrace
 from .room import BuiltinScene, stereo_frames, write_stereo_index
 
 Depth = Literal["exact", "network", "none"]
@@ -65,7 +67,8 @@ class StudioSize(BuiltinScene):
     num_points: int = 10_000
 
 
-def _static_bodies() -> list[Body]:
+def static_bodies() -> list[Body]:
+    """The room, the table and the objects that rest on it."""
     room = ((0.60, 0.63, 0.70), (0.74, 0.71, 0.63))
     wood, leg = ((0.84, 0.77, 0.56), (0.75, 0.66, 0.47)), ((0.52, 0.42, 0.30), (0.45, 0.36, 0.26))
     blue, grey = ((0.24, 0.40, 0.74), (0.88, 0.87, 0.78)), ((0.42, 0.52, 0.66), (0.80, 0.82, 0.84))
@@ -85,7 +88,7 @@ def _static_bodies() -> list[Body]:
     ]
 
 
-def _moving_bodies(time: float) -> list[Body]:
+def moving_bodies(time: float) -> list[Body]:
     """The ring tumbles while it swings to and fro; the blob rolls, is squashed and changes its lobes."""
     angle = 2.0 * math.pi * time
     ring = (0.30 + 0.55 * math.sin(angle + 0.4), -0.10 + 0.25 * math.cos(angle), 1.12 + 0.14 * math.sin(2.0 * angle))
@@ -119,7 +122,8 @@ def looking_at_table(position: Vector) -> Float[np.ndarray, "3 3"]:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def _camera(time: float, shift: float, size: StudioSize) -> Camera:
+def camera_at(time: float, shift: float, size: StudioSize) -> Camera:
+    """The hand-held camera at a time in [0, 1], moved to its right by ``shift`` [world units]."""
     rotation, position = _pose(time, shift)
     return lens_of(size).camera(rotation, position, time)
 
@@ -129,17 +133,22 @@ def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, 
 
     The time is in [0, 1], and the camera ``shift`` [world units] to the right of the training camera.
     """
-    return trace_from(_camera(time, shift, size), size)
+    return trace_from(camera_at(time, shift, size), size)
 
 
 def trace_from(camera: Camera, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:
     """The same through a camera in world units, at its time, which may be later than 1."""
-    cpu = torch.device("cpu")  # a GPU rounds otherwise
-    static = _static_bodies()
-    bodies = as_tensors([*static, *_moving_bodies(camera.time)], cpu)
-    lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]], dtype=torch.float32)
-    traced = raytrace(bodies, lamp, even_samples(size.num_samples, cpu), camera.viewmat, camera.K, camera.size)
+    static = static_bodies()
+    traced = trace_bodies([*static, *moving_bodies(camera.time)], camera, size.num_samples)
     return traced.image, traced.depth, traced.bodies < len(static)
+
+
+def trace_bodies(bodies: Sequence[Body], camera: Camera, num_samples: int) -> TracedImage:
+    """What a camera in world units sees of bodies under the lamp of the studio."""
+    cpu = torch.device("cpu")  # a GPU rounds otherwise
+    lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]], dtype=torch.float32)
+    samples = even_samples(num_samples, cpu)
+    return raytrace(as_tensors(bodies, cpu), lamp, samples, camera.viewmat, camera.K, camera.size)
 
 
 def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:

@@ -15,6 +15,7 @@ from warpgs.data.image_circle import with_image_circle
 from warpgs.data.masks import check_perturbation
 from warpgs.data.missing import missing_folder
 from warpgs.data.readout import with_readout
+from warpgs.data.tracks import read_tracks
 from warpgs.data.writer import FINISHED, STATE, WORK
 from warpgs.errors import command, missing, not_one_of
 from warpgs.files import read_json
@@ -95,6 +96,7 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     _require_sides(root, capture)
     capture = with_camera_ids(with_image_circle(capture))
     capture.layout = describe_layout(root, layout, dataset)
+    capture.tracks = read_tracks(root, capture.film)
     try:
         return with_readout(capture, capture.readout if options.readout is None else options.readout)
     except ValueError as error:
