@@ -302,7 +302,7 @@ def test_a_hypernerf_capture_stays_one(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--add", "masks,colours"], "--add must be one or more of masks, depth, points, got masks,colours"),
+        (["--add", "masks,colours"], "--add must be one or more of masks, depth, points, tracks, got masks,colours"),
         (["--add", ""], "--add must be one or more"),
         (["--add", "masks", "--masks", "none"], "--masks must be one of motion, sam2"),
         (["--add", "depth", "--depth", "none"], "--depth must be one of flow, anything"),
@@ -339,3 +339,59 @@ def test_too_few_frames_for_masks_are_refused(tmp_path):
     root = captures.write_capture(tmp_path / "toy", "hypernerf")
     with pytest.raises(ValueError, match="4 frames are too few to find what moves"):
         add_parts(root, AddOptions(["masks"]))
+
+
+def test_masks_of_a_network_are_copied_and_count_as_estimates(root, tmp_path):
+    masks = np.array([red_part(root, name) for name in NAMES])
+    np.savez(tmp_path / "masks.npz", masks=masks)
+    lines = []
+    add_parts(root, AddOptions(["masks"], masks=str(tmp_path / "masks.npz")), lines.append)
+    assert lines[0].startswith("masks: 12 frames")
+    for name, mask in zip(NAMES, masks, strict=True):
+        np.testing.assert_array_equal(written_mask(root, name), mask)
+        assert written_mask(root, name, "2x").shape == (96, 128)
+    assert load_capture(root).estimated_masks
+    assert (root / "masks.png").is_file()
+
+
+def test_depth_of_a_network_is_copied_as_inverse_depth(root, tmp_path):
+    depth = np.random.default_rng(0).uniform(1.0, 4.0, (COUNT, 96, 128))
+    np.savez(tmp_path / "results.npz", depth=depth)
+    lines = []
+    add_parts(root, AddOptions(["depth"], depth=str(tmp_path / "results.npz")), lines.append)
+    assert lines[0].startswith("depth: 12 frames, known on 100%")
+    for name, plane in zip(NAMES, depth, strict=True):
+        found = np.load(root / f"depth/1x/{name}.npy").astype(float)
+        np.testing.assert_allclose(found * plane, np.full_like(plane, np.median(found * plane)), rtol=2e-3)
+
+
+def test_tracks_of_a_network_are_copied(root, tmp_path, capsys):
+    positions = np.random.default_rng(0).uniform(10.0, 180.0, (COUNT, 20, 2))
+    np.savez(tmp_path / "result.npz", pred_tracks=positions, pred_visibility=np.ones((COUNT, 20), bool))
+    command = ["prepare", str(root), "--add", "tracks", "--tracks", str(tmp_path / "result.npz")]
+    assert main(command) == 0
+    assert "tracks: 20 points, seen in 100% of 12 frames" in capsys.readouterr().out
+    tracks = load_capture(root).tracks
+    assert tracks.frames == tuple(NAMES)
+    expected = (positions.transpose(1, 0, 2) + 0.5) / (256, 192)
+    np.testing.assert_allclose(tracks.positions, expected, atol=1e-6)
+    assert main(command) == 0
+    assert "tracks: they are there" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--add", "tracks"], "--add tracks and --tracks FILE belong together"),
+        (["--add", "masks", "--tracks", "a.npz"], "--add tracks and --tracks FILE belong together"),
+        (["--add", "masks", "--masks", "no/such/masks"], "or an existing file or folder"),
+    ],
+)
+def test_results_that_are_not_given_are_refused(root, options, message, capsys):
+    assert main(["prepare", str(root), *options]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_tracks_need_a_capture(tmp_path, capsys):
+    assert main(["prepare", "video.mp4", str(tmp_path / "capture"), "--tracks", "a.npz"]) == 2
+    assert "--tracks is for a capture that is there" in capsys.readouterr().err

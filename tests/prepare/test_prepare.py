@@ -16,11 +16,11 @@ from tests.prepare import boards
 from warpgs.captures.check import check_capture
 from warpgs.captures.opening import load_capture
 from warpgs.data.lens import Lens
+from warpgs.data.results.masks import read_object_mask
 from warpgs.prepare import pipeline
 from warpgs.prepare.cameras.recovered import Cameras, NoCamerasError
 from warpgs.prepare.cameras.sphere import points_around
 from warpgs.prepare.journal import Journal
-from warpgs.prepare.masks.given import read_dynamic
 from warpgs.prepare.options import Options, Selection
 
 
@@ -336,15 +336,15 @@ def test_masks_of_another_aspect_ratio_are_refused_and_smaller_ones_enlarged(tmp
     mask = np.where(boards.record(2)[1][0], 0, 255).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "half.png"), mask[::2, ::2])
     cv2.imwrite(str(tmp_path / "upright.png"), np.rot90(mask))
-    assert (read_dynamic(tmp_path / "half.png", boards.SIZE) == (mask == 0)).mean() > 0.99
+    assert (read_object_mask(tmp_path / "half.png", boards.SIZE) == (mask == 0)).mean() > 0.99
     double = np.full((2 * mask.shape[0], 2 * mask.shape[1]), 255, np.uint8)
     double[41, 60] = 0
     cv2.imwrite(str(tmp_path / "double.png"), double)
-    assert np.argwhere(read_dynamic(tmp_path / "double.png", boards.SIZE)).tolist() == [[20, 30]]
+    assert np.argwhere(read_object_mask(tmp_path / "double.png", boards.SIZE)).tolist() == [[20, 30]]
     with pytest.raises(
         ValueError, match=r"upright\.png: the mask is 192×256, but the images of its camera are 256×192"
     ):
-        read_dynamic(tmp_path / "upright.png", boards.SIZE)
+        read_object_mask(tmp_path / "upright.png", boards.SIZE)
 
 
 def test_a_missing_mask_is_named(shots, tmp_path):

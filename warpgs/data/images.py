@@ -100,6 +100,16 @@ def image_size(path: Path) -> tuple[int, int]:
     return _read_checked(path, MAX_PIXELS)[1]
 
 
+def palette_of(path: Path) -> UInt8[np.ndarray, "K 3"] | None:
+    """The colours of the palette of a PNG file; None if it is a file without one; raises as ``decode``."""
+    data = _read_checked(path, MAX_PIXELS)[0]
+    if not data.startswith(_PNG) or data[_PNG_COLOR_TYPE : _PNG_COLOR_TYPE + 1] != b"\x03":
+        return None
+    start = data.find(b"PLTE")
+    length = int.from_bytes(data[start - 4 : start], "big")
+    return np.frombuffer(data, np.uint8, length - length % 3, start + 4).reshape(-1, 3)
+
+
 def is_transparent(path: Path) -> bool:
     """Whether a file is a PNG image with a pixel that is not opaque; it is decoded only if it may have one.
 

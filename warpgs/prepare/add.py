@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 
 from warpgs.captures.opening import load_capture
 from warpgs.command_line.progress import progress
@@ -24,13 +24,18 @@ from warpgs.data.images import decode, is_bright, read_mask
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import LOADERS, LoadOptions, missing_capture, recognize, require_finished
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
+from warpgs.data.resized import resize_mask
+from warpgs.data.results.depth import read_depths
+from warpgs.data.results.masks import read_masks
+from warpgs.data.results.tracks import read_tracked_points
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.data.tracks import make_tracks, read_tracks, write_tracks
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.errors import not_one_of
 from warpgs.files import read_json, write_json
 from warpgs.locks import lock_folder
 
-from .cameras.posed_frames import PosedFrames, pixel_rays
+from .cameras.posed_frames import PosedFrames, common_lens, resampled
 from .cameras.recovered import are_apart
 from .checks import MIN_FOR_MOTION
 from .contact_sheet import choose_evenly, colored_depth, overlay_mask, write_contact_sheet
@@ -39,34 +44,15 @@ from .depth.methods import DEPTHS
 from .frames.images import resize_to_side
 from .masks.masker import WORKING_SIDE, DynamicMasks
 from .masks.methods import MASKERS
+from .options import PARTS, AddOptions
 from .weights import find_weights
-
-PARTS = ("masks", "depth", "points")
-"""What can be added."""
 
 MAX_POINT_FRAMES = 40
 """Number of frames, evenly spread, that points are taken from."""
 
 
-@dataclass(frozen=True)
-class AddOptions:
-    """How to add parts.
-
-    Attributes:
-        parts: Members of ``PARTS``.
-        masks: A name in ``masks.MASKERS``, not "none".
-        depth: A name in ``depth.DEPTHS``, not "none".
-        weights: Folder with the weights of the networks; None for the Hugging Face cache.
-    """
-
-    parts: Sequence[str]
-    masks: str = "motion"
-    depth: str = "flow"
-    weights: Path | None = None
-
-
 def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None = None) -> None:
-    """Adds masks, depth or points that a capture lacks; what it has stays as it is.
+    """Adds masks, depth, points or tracks that a capture lacks; what it has stays as it is.
 
     Args:
         root: Capture in the layout of warpgs, or of NeRF-DS, HyperNeRF or DyCheck.
@@ -101,8 +87,10 @@ def _check_options(options: AddOptions) -> None:
         raise ValueError(f"--add must be one or more of {', '.join(PARTS)}, got {','.join(options.parts) or 'nothing'}")
     for name, value, methods in (("masks", options.masks, MASKERS), ("depth", options.depth, DEPTHS)):
         known = [method for method, implementation in methods.items() if implementation is not None]
-        if value not in known:
-            raise ValueError(not_one_of(f"to add {name}, --{name}", value, known))
+        if value not in known and not Path(value).exists():
+            raise ValueError(not_one_of(f"to add {name}, --{name}", value, known) + ", or an existing file or folder")
+    if ("tracks" in options.parts) != (options.tracks is not None):
+        raise ValueError("--add tracks and --tracks FILE belong together")
 
 
 class _Depth(NamedTuple):
@@ -151,7 +139,7 @@ class _Job:
             return
         lacking = [video for video in videos if not set(video).isdisjoint(missing)]
         for video in lacking:
-            if len(video) < MIN_FOR_MOTION:
+            if len(video) < MIN_FOR_MOTION and self.options.masks in MASKERS:
                 whose = f" of the camera of {video[0]}" if len(videos) > 1 else ""
                 raise ValueError(
                     f"{len(video)} frames{whose} are too few to find what moves, at least {MIN_FOR_MOTION} are needed"
@@ -168,7 +156,9 @@ class _Job:
         self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
 
     def _estimate_masks(self, video: list[str], missing: set[str]) -> DynamicMasks:
-        """The masks of a camera's frames, of which those of the ``missing`` ones are written."""
+        """The masks of a camera's frames at working size, of which those of the ``missing`` ones are written."""
+        if self.options.masks not in MASKERS:
+            return self._copy_masks(video, missing)
         method = MASKERS[self.options.masks]
         assert method is not None
         folder = find_weights(method.network, self.options.weights)
@@ -176,13 +166,31 @@ class _Job:
         if {"depth", "points"} & set(self.options.parts):
             frames.halved.triangulated = {}
         masks = method.find(frames, folder, self.log is None)
-        self._keep_layout({} if missing.isdisjoint(self.capture.train) else {"masks": writer.ESTIMATED})
+        self._keep_layout_of_estimates(missing)
         for name, mask in zip(video, masks, strict=True):
             if name in missing:
                 lens = self._lens(name)
-                dynamic = _resampled(mask.astype(np.float32), frames.lens, lens, cv2.INTER_LINEAR) > 0.5
+                dynamic = resampled(mask.astype(np.float32), frames.lens, lens, cv2.INTER_LINEAR) > 0.5
                 writer.write_mask(self.root, name, ~dynamic, self._factors())
         return masks
+
+    def _copy_masks(self, video: list[str], missing: set[str]) -> DynamicMasks:
+        """The same from the file or folder of a network."""
+        images, masks = self._posed(video, WORKING_SIDE).images, []
+        found = [*read_masks(Path(self.options.masks), video, self._sizes(video))]
+        self._keep_layout_of_estimates(missing)
+        for name, image, mask in zip(video, images, found, strict=True):
+            if name in missing:
+                writer.write_mask(self.root, name, ~mask, self._factors())
+            masks.append(~resize_mask(~mask, image.shape[1::-1]))
+        return masks
+
+    def _sizes(self, names: list[str]) -> list[tuple[int, int]]:
+        """Width and height of frames in full size."""
+        return [(lens.width, lens.height) for lens in map(self._lens, names)]
+
+    def _keep_layout_of_estimates(self, missing: set[str]) -> None:
+        self._keep_layout({} if missing.isdisjoint(self.capture.train) else {"masks": writer.ESTIMATED})
 
     def _keep_layout(self, entries: dict[str, str]) -> None:
         """Names the layout in dataset.json, because masks in full size make another dataset of it, and adds entries.
@@ -232,16 +240,14 @@ class _Job:
         if not missing:
             self._say("depth: all frames have it")
             return
-        chosen = [video for video in self._seen_apart(videos, self.options.depth) if not missing.isdisjoint(video)]
+        seen_apart = self._seen_apart(videos, self.options.depth) if self.options.depth in DEPTHS else videos
+        chosen = [video for video in seen_apart if not missing.isdisjoint(video)]
         sheets, known = [], list[float]()
         for video in chosen:
-            frames, _, planes = self._depth(video, self.options.depth)
+            planes = self._planes(video)
             for name, plane in zip(video, planes, strict=True):
                 if name in missing:
-                    lens = self._lens(name)
-                    lens = lens.resized(frames.lens.width, round(frames.lens.width * lens.height / lens.width))
-                    resampled = _resampled(plane, frames.lens, lens, cv2.INTER_NEAREST)
-                    writer.write_depth(self.root, name, as_half(resampled))
+                    writer.write_depth(self.root, name, as_half(plane))
             shown = choose_evenly(len(video), len(chosen))
             sheets.append({video[k]: colored_depth(planes[k]) for k in shown})
             known += [float(np.isfinite(plane).mean()) for plane in planes]
@@ -251,6 +257,33 @@ class _Job:
         write_contact_sheet(self.root / "depth.png", sheets)
         count = len(missing & {name for video in chosen for name in video})
         self._say(f"depth: {count} frames, known on {np.mean(known):.0%} of the pixels: look at depth.png")
+
+    def _planes(self, video: list[str]) -> list[Float[np.ndarray, "H W"]]:
+        """Inverse depth of a camera's frames, estimated or from the file or folder of a network."""
+        if self.options.depth not in DEPTHS:
+            return [*read_depths(Path(self.options.depth), video, self._sizes(video))]
+        frames, _, planes = self._depth(video, self.options.depth)
+        width, found = frames.lens.width, []
+        for name, plane in zip(video, planes, strict=True):
+            lens = self._lens(name)
+            lens = lens.resized(width, round(width * lens.height / lens.width))
+            found.append(resampled(plane, frames.lens, lens, cv2.INTER_NEAREST))
+        return found
+
+    def add_tracks(self) -> None:
+        """Writes tracks.npz from the file of a network, if the capture has no tracks."""
+        path, frames = self.options.tracks, self.capture.film
+        assert path is not None
+        if read_tracks(self.root, frames) is not None:
+            self._say("tracks: they are there")
+            return
+        (size, *_) = self._sizes([self.capture.train[0]])
+        found = read_tracked_points(path, size)
+        tracks = make_tracks(path, frames, *found, size)
+        write_tracks(self.root, *found, size)
+        self._say(
+            f"tracks: {len(found.positions)} points, seen in {tracks.visible.mean():.0%} of {len(tracks.frames)} frames"
+        )
 
     def add_points(self) -> None:
         """Writes points.npy and point_colors.npy, from optical flow, if the capture has no points."""
@@ -321,14 +354,14 @@ class _Job:
         return self.posed[key]
 
     def _resized(self, names: list[str], side: int, max_factor: float) -> PosedFrames:
-        common = _common([Lens.of(self.capture.cameras[name]) for name in names])
+        common = common_lens([Lens.of(self.capture.cameras[name]) for name in names])
         images = []
         for name in progress(names, "reading images", self.log is None):
             frame = self.capture.frame(name)
             small = resize_to_side(frame.image.numpy(), side, max_factor)
             height, width = small.shape[:2]
             own = Lens.of(frame.camera).resized(width, height)
-            images.append(_resampled(small, own, common.resized(width, height), cv2.INTER_LINEAR))
+            images.append(resampled(small, own, common.resized(width, height), cv2.INTER_LINEAR))
         poses = np.array([self.capture.cameras[name].viewmat[:3].double().numpy() for name in names])
         height, width = images[0].shape[:2]
         return PosedFrames(images, common.resized(width, height), poses, self._points(names))
@@ -354,7 +387,7 @@ class _Job:
             return np.ones((lens.height, lens.width), bool)
         camera, own = read_camera(self.root / f"camera/{name}.json", self.units, self.factor, 0.0)
         dynamic = ~read_mask(path, camera.size)
-        return _resampled(dynamic.astype(np.float32), own, lens, cv2.INTER_LINEAR) < 0.5
+        return resampled(dynamic.astype(np.float32), own, lens, cv2.INTER_LINEAR) < 0.5
 
     def _lens(self, name: str) -> Lens:
         """The lens of a frame's full-size file."""
@@ -363,22 +396,3 @@ class _Job:
     def _say(self, line: str) -> None:
         if self.log is not None:
             self.log(line)
-
-
-def _common(lenses: Sequence[Lens]) -> Lens:
-    """The lens of all frames, or a pinhole with the medians of their focal lengths and principal points."""
-    if len(set(lenses)) == 1:
-        return lenses[0]
-    fx, fy, cx, cy = np.median([(*lens.focal, *lens.center) for lens in lenses], axis=0).tolist()
-    return Lens(lenses[0].width, lenses[0].height, (fx, fy), (cx, cy))
-
-
-def _resampled(
-    image: Float[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"], source: Lens, target: Lens, interpolation: int
-) -> Float[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]:
-    """What a camera with the lens ``target`` sees of the image of another one at the same place."""
-    if source == target:
-        return image
-    rays = pixel_rays(target)
-    x, y = (source.image(rays[..., 0], rays[..., 1]) - 0.5).astype(np.float32)
-    return cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)

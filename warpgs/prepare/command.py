@@ -5,7 +5,7 @@ from warpgs.errors import ending_at_once, terminable
 
 from .options import Prepare
 
-USED_BY_ADD = ("paths", "add", "options", "masks", "depth", "weights", "quiet")
+USED_BY_ADD = ("paths", "add", "tracks", "options", "masks", "depth", "weights", "quiet")
 """Options that mean something with ``--add``."""
 
 
@@ -17,10 +17,11 @@ def run_prepare(options: Prepare) -> None:
             from .add import AddOptions, add_parts
         _check_alone(options)
         how = options.options
-        add_parts(
-            options.paths[0], AddOptions(options.add.split(","), how.masks, how.depth or "flow", how.weights), log
-        )
+        parts = AddOptions(options.add.split(","), how.masks, how.depth or "flow", how.weights, options.tracks)
+        add_parts(options.paths[0], parts, log)
         return
+    if options.tracks is not None:
+        raise ValueError("--tracks is for a capture that is there: warpgs prepare CAPTURE --add tracks --tracks FILE")
     if len(options.paths) < 2:
         raise ValueError("prepare needs a source and a folder for the capture, or a capture and --add")
     with ending_at_once():

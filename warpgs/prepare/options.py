@@ -1,5 +1,6 @@
 """Options of ``warpgs prepare``."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,6 +18,28 @@ CameraMotion = Literal["moving", "turning", "still"]
 MIN_FRAMES = 5
 MAX_FRAMES = 1000
 """Minimum and maximum number of frames of a capture; more take more memory than they are worth."""
+
+PARTS = ("masks", "depth", "points", "tracks")
+"""What can be added."""
+
+
+@dataclass(frozen=True)
+class AddOptions:
+    """How to add parts.
+
+    Attributes:
+        parts: Members of ``PARTS``.
+        masks: A name in ``masks.MASKERS``, not "none", or a file or folder that ``data/results/masks.py`` reads.
+        depth: A name in ``depth.DEPTHS``, not "none", or a file or folder that ``data/results/depth.py`` reads.
+        weights: Folder with the weights of the networks; None for the Hugging Face cache.
+        tracks: A file that ``data/results/tracks.py`` reads.
+    """
+
+    parts: Sequence[str]
+    masks: str = "motion"
+    depth: str = "flow"
+    weights: Path | None = None
+    tracks: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -50,11 +73,12 @@ class Options:
     """moving, turning (on the spot) or still (on a tripod). The last two give no depth, and no views from elsewhere. Of
     several cameras, each may move or stand still."""
     masks: str = "motion"
-    """How to find what moves: motion, sam2 (motion refined by a network), none, or a folder of masks (0 = dynamic)
-    named like the source's files or like the capture's frames."""
+    """How to find what moves: motion, sam2 (motion refined by a network), none, or a folder of masks (0 = dynamic; ids
+    of objects in PNG files with a palette) named like the source's files or like the capture's frames. With --add also
+    an .npz file of masks."""
     depth: str | None = None
     """How to estimate depth: flow (static surfaces, by optical flow; the default of a moving camera), anything (all
-    pixels, by a network) or none."""
+    pixels, by a network) or none. With --add also results of Depth Anything 3, VGGT or MoGe: a file or a folder."""
     holdout: int = 0
     """Keep every N-th frame of each camera for evaluation (val_ids); 0 keeps none."""
     holdout_camera: Annotated[tuple[str, ...], tyro.conf.arg(metavar="VIDEO …")] = ()
@@ -100,7 +124,9 @@ class Prepare:
     """Video, or folder of PNG or JPEG frames of one size, or several videos, each of a camera of its own; then the
     folder to write the capture to. With --add the capture alone."""
     add: str | None = None
-    """Add these to a capture that lacks them: masks, depth and points, separated by commas."""
+    """Add these to a capture that lacks them: masks, depth, points and tracks, separated by commas."""
+    tracks: Path | None = None
+    """With --add tracks, the .npz file of CoTracker, TAPIR or SpatialTracker for the capture's frames in full size."""
     options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
     force: bool = False
     """Replace an existing capture of prepare; other files are kept."""

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from warpgs.data.lens import Lens
+from warpgs.data.results.masks import read_object_mask
 from warpgs.data.writer import held_out_of
 
 from .cameras.intrinsics import read_intrinsics
@@ -36,7 +37,7 @@ from .frames.take import Frames, take_frames, take_videos
 from .journal import Journal
 from .masks.background import SIDE, off_background
 from .masks.files import Masks, mask_files, write_masks
-from .masks.given import find_given_masks, read_dynamic
+from .masks.given import find_given_masks
 from .masks.masker import WORKING_SIDE, find_masks
 from .masks.methods import MASKERS
 from .options import Options
@@ -274,7 +275,7 @@ class Steps:
             return write_masks(
                 path,
                 (
-                    (video.names, [read_dynamic(file, (video.width, video.height)) for file in files])
+                    (video.names, [read_object_mask(file, (video.width, video.height)) for file in files])
                     for video, files in zip(self.videos, found, strict=True)
                 ),
             )

@@ -180,3 +180,22 @@ def load_posed_frames(folder: Path, cameras: Cameras, side: int, max_factor: flo
 def pixel_rays(lens: Lens) -> Float[np.ndarray, "H W 2"]:
     """[H, W, 2] x, y on the plane z = 1 of the centre of every pixel of a distorted image."""
     return np.stack(lens.unproject(*lens.pixel_centers()), -1).astype(np.float32)
+
+
+def common_lens(lenses: Sequence[Lens]) -> Lens:
+    """The lens of all frames, or a pinhole with the medians of their focal lengths and principal points."""
+    if len(set(lenses)) == 1:
+        return lenses[0]
+    fx, fy, cx, cy = np.median([(*lens.focal, *lens.center) for lens in lenses], axis=0).tolist()
+    return Lens(lenses[0].width, lenses[0].height, (fx, fy), (cx, cy))
+
+
+def resampled(
+    image: Float[np.ndarray, "h w"] | UInt8[np.ndarray, "h w 3"], source: Lens, target: Lens, interpolation: int
+) -> Float[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]:
+    """What a camera with the lens ``target`` sees of the image of another one at the same place."""
+    if source == target:
+        return image
+    rays = pixel_rays(target)
+    x, y = (source.image(rays[..., 0], rays[..., 1]) - 0.5).astype(np.float32)
+    return cv2.remap(image, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)

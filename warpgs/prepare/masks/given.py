@@ -3,11 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Bool
-
 from warpgs.data.loaders.listed import find_file
-from warpgs.data.resized import read_resized_mask
 
 from ..frames.take import SourceFrame
 
@@ -33,14 +29,3 @@ def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> list[Path]:
         name = frame.name if found is as_frames else Path(frame.source).stem
         raise ValueError(f"{folder} has no mask for {frame.name} ({frame.source}): expected {name}.png")
     return [path for path in found if path is not None]
-
-
-def read_dynamic(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """[H, W] true where a mask file is dynamic, resized to ``size`` (width, height).
-
-    A pixel of a reduced mask is dynamic if any part of it is.
-
-    Raises:
-        ValueError: If it is damaged or its aspect ratio is not that of the frame.
-    """
-    return ~read_resized_mask(path, size)

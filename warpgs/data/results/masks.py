@@ -1,0 +1,74 @@
+"""Masks of objects as SAM 2 and SAM 3 give them: what is of an object is dynamic."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Shaped
+
+from warpgs.data.images import decode, palette_of
+from warpgs.data.loaders.listed import find_file
+from warpgs.data.npz import names_of, read_npz
+from warpgs.data.resized import check_shape, read_resized_mask, resize_mask
+
+ARRAYS = ("masks", "out_binary_masks")
+"""Names of the array of masks: [F, H, W], or with axes of objects before the last two."""
+
+
+def read_object_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """True where a mask file is dynamic, resized to ``size`` (width, height): any part of a pixel is.
+
+    A PNG file with a palette of colours holds ids of objects, and 0 where static; any other one is 0 where dynamic.
+
+    Raises:
+        ValueError: If it is damaged, or of another shape.
+    """
+    palette = palette_of(path)
+    if palette is None or (palette == palette[:, :1]).all():
+        return ~read_resized_mask(path, size)
+    stored = decode(path)[..., :3]
+    check_shape(path, "the mask", (stored.shape[1], stored.shape[0]), size)
+    return ~resize_mask((stored == palette[0, ::-1]).all(2), size)
+
+
+def read_masks(path: Path, names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Iterator[Bool[np.ndarray, "H W"]]:
+    """What is dynamic in frames, in their size.
+
+    Args:
+        path: An .npz file with the masks of all frames; or a folder with a PNG or .npz file of each, named like it.
+        names: Ids of all frames of the camera, by time.
+        sizes: Width and height of each.
+
+    Raises:
+        ValueError: If there is no mask of a frame, or it is damaged, of other frames or of another shape.
+    """
+    if not path.is_dir():
+        masks = _read(path)
+        if masks.ndim < 3 or len(masks) != len(names):
+            raise ValueError(
+                f"{path}: masks must be [N, H, W] of the camera's {len(names)} frames, got {list(masks.shape)}"
+            )
+        for mask, size in zip(masks, sizes, strict=True):
+            yield _joined(path, mask, size)
+        return
+    for name, size in zip(names, sizes, strict=True):
+        file = find_file(path, name, (".png", ".png.png", ".npz"))
+        if file is None:
+            raise ValueError(f"{path} has no mask of frame {name}: expected {name}.png or {name}.npz")
+        yield read_object_mask(file, size) if file.suffix.lower() == ".png" else _joined(file, _read(file), size)
+
+
+def _read(path: Path) -> Shaped[np.ndarray, "..."]:
+    key = next((name for name in ARRAYS if name in names_of(path)), None)
+    if key is None:
+        raise ValueError(f"{path} has no array {' or '.join(ARRAYS)}")
+    return read_npz(path, (key,))[key]
+
+
+def _joined(path: Path, mask: Shaped[np.ndarray, "..."], size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """What is of any object; logits are of one where positive."""
+    if mask.ndim < 2 or 0 in mask.shape[-2:]:
+        raise ValueError(f"{path}: a mask must be [H, W], or [objects, H, W], got {list(mask.shape)}")
+    check_shape(path, "the mask", (mask.shape[-1], mask.shape[-2]), size)
+    is_object = np.any(mask.reshape(-1, *mask.shape[-2:]) > 0, axis=0)
+    return ~resize_mask(np.logical_not(is_object), size)
