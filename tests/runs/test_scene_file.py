@@ -131,7 +131,7 @@ def test_a_file_is_filmed_along_a_spiral_by_default(file, tmp_path):
 def test_a_file_is_exported_in_another_format_with_edits(file, tmp_path):
     editing = Editing(Edits(max_gaussians=30), save_edits=True)
     summary = export_run(Export(file, format="spz3", editing=editing, quiet=True))
-    assert "-y is taken as up" in summary
+    assert "-y is taken as up (otherwise give --up), because a.ply has no capture, which --data gives" in summary
     assert "edits keep 30 of 80 Gaussians" in summary
     assert "in training" not in summary
     assert (tmp_path / "a" / "edits.json").is_file()

@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from warpgs.data.capture import Capture
 from warpgs.editing.edited_scene import with_edits
 from warpgs.runs.run import Run
+from warpgs.runs.scene_file import SceneFile
 from warpgs.video.camera_paths import UP
 
 from . import orientation
@@ -94,6 +95,8 @@ class Job:
     @cached_property
     def _capture(self) -> tuple[Capture | None, str]:
         """The capture, or None and why."""
+        if isinstance(self.run, SceneFile) and not self.run.has_capture:
+            return None, f"{self.run.files[0].name} has no capture, which --data gives"
         try:
             return self.run.open_corrected_capture(self.options.quiet), ""
         except (ValueError, OSError) as error:
