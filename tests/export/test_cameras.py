@@ -225,6 +225,35 @@ def test_colmap_cameras_that_are_no_frames_are_evenly_spaced_in_time(tmp_path):
     assert len(made.cameras) == 5
 
 
+@pytest.fixture
+def rig(tmp_path):
+    """Cameras of two folders of frames, and a function that writes a COLMAP model of images."""
+    names = [f"cam{i}_{k:04d}" for i in range(2) for k in range(3)]
+    cameras = {name: dataclasses.replace(camera(k), time=(k % 3) / 2) for k, name in enumerate(names)}
+    capture = Capture("rig", cameras, names, [], POINTS, None, lambda name: None)
+
+    def write(images):
+        written = {image: cameras[names[k]] for k, image in enumerate(images)}
+        made = CameraSet.of(Capture("model", written, [*written], [], POINTS, None, lambda name: None), np.eye(3), 1.0)
+        write_cameras(tmp_path, "colmap", made)
+        return tmp_path
+
+    return capture, write
+
+
+def test_frames_of_several_cameras_are_told_apart_by_their_folders(rig):
+    capture, write = rig
+    read = read_cameras(write(["cam0/0000", "cam0/0001", "cam1/0002"]), capture)
+    assert [c.time for c in read] == [0.0, 0.5, 1.0]
+
+
+def test_images_of_which_only_some_are_frames_are_named(rig):
+    capture, write = rig
+    message = r"1 of 3 images are no frames of the capture, which tell the times: .*cam2/0002.*; expected .* cam0_0000"
+    with pytest.raises(ValueError, match=message):
+        read_cameras(write(["cam0/0000", "cam0/0001", "cam2/0002"]), capture)
+
+
 def test_a_time_outside_of_the_scene_is_refused(tmp_path):
     made = written(tmp_path, "nerfstudio")
     transforms = json.loads((tmp_path / "transforms.json").read_text())

@@ -12,11 +12,13 @@ import numpy as np
 import torch
 
 from warpgs.cameras import Camera
+from warpgs.captures.findings import few_of
 from warpgs.data.camera_files import is_rotation
 from warpgs.data.capture import Capture
 from warpgs.data.colmap import load_model
 from warpgs.data.colmap_folders import find_models
 from warpgs.data.lens import Lens
+from warpgs.data.loaders.listed import without_image_suffix
 from warpgs.data.loaders.transforms import Transforms
 from warpgs.files import natural_order, read_numbers
 
@@ -35,7 +37,8 @@ def read_cameras(path: Path, capture: Capture) -> list[Camera]:
         capture: The capture of the run.
 
     Raises:
-        ValueError: If there is no such file, it is damaged, a lens is not supported or a time is outside of [0, 1].
+        ValueError: If there is no such file, it is damaged, a lens is not supported, a time is outside of [0, 1], or it
+            has none and only some cameras are called like frames.
     """
     if path.is_dir() and not (path / INDEX).is_file():
         named, times = _of_colmap(path)
@@ -46,13 +49,34 @@ def read_cameras(path: Path, capture: Capture) -> list[Camera]:
         named, times = _of_transforms(index)
     if len(named) > MAX_FRAMES:
         raise ValueError(f"{path} has {len(named):,} cameras, the maximum is {MAX_FRAMES:,}")
-    names = [Path(name).stem for name, _ in named]
-    if times is None and all(name in capture.cameras for name in names):
-        times = [capture.cameras[name].time for name in names]
+    times = times or _times_of_frames(path, [name for name, _ in named], capture)
     by_time = sorted(zip(times or evenly_spaced(len(named)), (camera for _, camera in named), strict=True), key=_time)
     first = by_time[0][1]
     cameras = [dataclasses.replace(camera, time=float(time)) for time, camera in by_time]
     return [camera if camera.size == first.size else filling(camera, first.size) for camera in cameras]
+
+
+def _times_of_frames(path: Path, images: Sequence[str], capture: Capture) -> list[float] | None:
+    """The times of the frames that images are; None if they are other images.
+
+    Raises:
+        ValueError: If some of them are frames and others are not.
+    """
+    frames = [_frame_of(image, capture) for image in images]
+    missing = [image for image, frame in zip(images, frames, strict=True) if frame is None]
+    if missing and len(missing) < len(images):
+        raise ValueError(
+            f"{path}: {len(missing)} of {len(images)} images are no frames of the capture, which tell the times: "
+            f"{few_of(missing)}; expected names such as {next(iter(capture.cameras))}"
+        )
+    return None if missing else [capture.cameras[frame].time for frame in frames if frame is not None]
+
+
+def _frame_of(image: str, capture: Capture) -> str | None:
+    """The frame of an image: ids have underscores for slashes, without folders that all images of the capture share."""
+    parts = Path(without_image_suffix(image)).parts
+    names = ("_".join(parts[k:]) for k in range(len(parts)))
+    return next((name for name in names if name in capture.cameras), None)
 
 
 Named = list[tuple[str, Camera]]
