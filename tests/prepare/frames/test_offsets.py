@@ -3,6 +3,7 @@
 from fractions import Fraction
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -42,6 +43,44 @@ def test_sound_that_begins_later_than_the_images_is_heard_later(tmp_path):
     late = event.heard(event.sound(), 4.0, SECONDS - 1.0)
     b = event.write_video(tmp_path / "b.mp4", IMAGES, late, sound_from=1.0)
     assert common_clock([write(tmp_path / "a.mp4", 3.0), b], None)[0].starts == pytest.approx([0.0, 0.0], abs=0.002)
+
+
+def test_sound_that_ends_early_is_sufficient(tmp_path):
+    b = event.write_video(tmp_path / "b.mp4", IMAGES, event.heard(event.sound(), 3.4, 2.0))
+    assert common_clock([write(tmp_path / "a.mp4", 3.0), b], None)[0].starts == pytest.approx([0.0, 0.4], abs=0.002)
+
+
+@pytest.mark.parametrize("part", [(0.0, 0.4), (0.3, 0.6), (0.5, 1.0)])
+def test_what_is_damaged_of_a_sound_is_skipped(tmp_path, part):
+    a, b = write(tmp_path / "a.mp4", 3.0), write(tmp_path / "b.mp4", 3.4)
+    with av.open(str(b)) as container:
+        packets = [(p.pos, p.size) for p in container.demux(container.streams.audio[0]) if p.size]
+    data, random = bytearray(b.read_bytes()), np.random.default_rng(0)
+    for begin, size in packets[int(part[0] * len(packets)) : int(part[1] * len(packets))]:
+        data[begin : begin + size] = random.bytes(size)
+    b.write_bytes(data)
+    assert common_clock([a, b], None)[0].starts == pytest.approx([0.0, 0.4], abs=0.002)
+
+
+def test_a_sound_may_change_its_rate(tmp_path):
+    first = event.write_video(tmp_path / "1.ts", IMAGES, event.heard(event.sound(), 3.4, 3.0))
+    second = event.heard(event.sound(), 6.4, 3.0, 44_100)
+    second = event.write_video(tmp_path / "2.ts", IMAGES, second, 44_100, sound_from=3.0)
+    both = tmp_path / "both.ts"
+    both.write_bytes(first.read_bytes() + second.read_bytes())
+    part, whole = (sound.read_onsets(path, Fraction(0)) for path in (first, both))
+    assert sound.compare([part, whole])[0, 1].offset == pytest.approx(0.0, abs=0.002)
+    assert (part.values.shape[1], whole.values.shape[1]) == pytest.approx((750, 1500), abs=20)
+
+
+def test_a_sound_that_cannot_be_decoded_is_named(tmp_path, monkeypatch):
+    def fail(**options: object) -> None:
+        raise ValueError("unknown\nformat")
+
+    videos = [write(tmp_path / "a.mp4", 3.0), write(tmp_path / "b.mp4", 3.4)]
+    monkeypatch.setattr(av, "AudioResampler", fail)
+    with pytest.raises(ValueError, match=r"^the sound of .*a\.mp4 cannot be decoded: unknown format; give the time"):
+        common_clock(videos, None)
 
 
 def test_a_video_is_placed_by_another_one_than_the_first(tmp_path):

@@ -84,11 +84,14 @@ def find_offsets(sources: Sequence[Path], first_frames: Sequence[Fraction], quie
     Each is compared with all others, and placed by the one that it resembles most.
 
     Raises:
-        ValueError: If one has no sound, resembles none of the others, or they contradict each other.
+        ValueError: If one has no sound or a damaged one, resembles none of the others, or they contradict each other.
     """
     onsets = []
     for source, first in zip(progress(sources, "sound", quiet), first_frames, strict=True):
-        found = read_onsets(source, first)
+        try:
+            found = read_onsets(source, first)
+        except ValueError as error:
+            raise ValueError(f"{error}; {GIVE}") from error
         if found is None:
             raise ValueError(f"{source} has no sound, which tells when it starts: {GIVE}")
         onsets.append(found)

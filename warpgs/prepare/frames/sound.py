@@ -6,8 +6,7 @@ a parabola, tells the offset to about a millisecond; how far it stands out of th
 the same.
 """
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from warpgs.data.video_frames import READ_LOCAL_FILES
+from warpgs.errors import one_line
 
 RATE, WINDOW, HOP = 8000, 256, 32
 """Samples per second, per window of the spectrum, and between windows: onsets every 4 ms."""
@@ -67,6 +67,9 @@ def read_onsets(source: Path, first_frame: Fraction) -> Onsets | None:
     Args:
         source: The video.
         first_frame: Time stamp of its first frame [s].
+
+    Raises:
+        ValueError: If the sound cannot be decoded.
     """
     samples, start = _read_samples(source)
     if len(samples) < WINDOW + HOP or np.ptp(samples) == 0:
@@ -76,29 +79,41 @@ def read_onsets(source: Path, first_frame: Fraction) -> Onsets | None:
 
 
 def _read_samples(source: Path) -> tuple[Float[np.ndarray, " N"], float]:
-    """Samples of a video's sound, and the time stamp of the first [s]; gaps are silent."""
-    resampler = av.AudioResampler(format="flt", layout="mono", rate=RATE)
-    pieces: list[tuple[float, np.ndarray]] = []
-    with av.open(str(source), options=READ_LOCAL_FILES) as container:
-        if not container.streams.audio:
-            return np.zeros(0, np.float32), 0.0
-        with suppress(av.FFmpegError):  # the sound before the damage is used
-            for frame in container.decode(container.streams.audio[0]):
-                if frame.time is None or (pieces and frame.time > pieces[0][0] + MAX_SECONDS):
-                    break
-                pieces += [_piece(out) for out in resampler.resample(frame)]
+    """Samples of a video's sound, and the time stamp of the first [s]; gaps and what is damaged are silent."""
+    try:
+        pieces = [*_read_pieces(source)]
+    except (av.FFmpegError, ValueError) as error:
+        raise ValueError(f"the sound of {source} cannot be decoded: {one_line(error)}") from error
     if not pieces:
         return np.zeros(0, np.float32), 0.0
     start = pieces[0][0]
-    places = [round((time - start) * RATE) for time, _ in pieces]
-    samples = np.zeros(max(place + len(piece) for place, (_, piece) in zip(places, pieces, strict=True)), np.float32)
-    for place, (_, piece) in zip(places, pieces, strict=True):
-        samples[max(place, 0) : max(place, 0) + len(piece)] = piece
+    placed = [(round((time - start) * RATE), piece) for time, piece in pieces if time >= start]
+    samples = np.zeros(max(place + len(piece) for place, piece in placed), np.float32)
+    for place, piece in placed:
+        samples[place : place + len(piece)] = piece
     return samples, start
 
 
-def _piece(frame: Any) -> tuple[float, np.ndarray]:
-    return float(frame.time), frame.to_ndarray()[0]
+def _read_pieces(source: Path) -> Iterator[tuple[float, Float[np.ndarray, " N"]]]:
+    """Pieces of a video's sound at ``RATE``, and the time stamp of the first sample of each [s]; damage is skipped."""
+    resamplers: dict[tuple[str, str, int], Any] = {}  # the format may change within a stream
+    with av.open(str(source), options=READ_LOCAL_FILES) as container:
+        end: float | None = None
+        for packet in container.demux(container.streams.audio[0]) if container.streams.audio else ():
+            try:
+                frames = packet.decode()
+            except av.FFmpegError:
+                continue
+            for frame in frames:
+                if frame.time is None:
+                    continue
+                end = frame.time + MAX_SECONDS if end is None else end
+                if frame.time > end:
+                    return
+                form = frame.format.name, frame.layout.name, frame.sample_rate
+                if form not in resamplers:
+                    resamplers[form] = av.AudioResampler(format="flt", layout="mono", rate=RATE)
+                yield from ((float(out.time), out.to_ndarray()[0]) for out in resamplers[form].resample(frame))
 
 
 def _onsets(samples: Float[np.ndarray, " N"]) -> Float[np.ndarray, "B T"]:
