@@ -1,6 +1,7 @@
 """The check says whether the cameras of a capture agree."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -72,7 +73,7 @@ def test_cameras_without_a_common_view_cannot_be_compared(root):
     for k in range(COUNT):
         other = boards.texture(50 + k, (120, 120, 120), 256, (9, 31))[:192]
         cv2.imwrite(str(root / f"rgb/1x/0_{k:06d}.png"), other)
-    assert ("note", "cameras 0 and 1 see too little alike to be compared") in agreement(root)
+    assert ("note", "cameras 0 and 1 see too little alike at one time to be compared") in agreement(root)
 
 
 def test_a_damaged_frame_to_evaluate_is_not_compared(root):
@@ -83,7 +84,7 @@ def test_a_damaged_frame_to_evaluate_is_not_compared(root):
         (root / f"rgb/1x/{name}.png").write_bytes(b"damaged")
     report = check_capture(root)
     assert any(f.topic == "evaluation" and f.level == "error" for f in report.findings)
-    assert ("note", "cameras 1 and 2 see too little alike to be compared") in agreement(root)
+    assert ("note", "cameras 1 and 2 see too little alike at one time to be compared") in agreement(root)
 
 
 def test_all_cameras_are_compared_with_the_one_next_to_them_at_nearly_one_time(tmp_path):
@@ -92,6 +93,20 @@ def test_all_cameras_are_compared_with_the_one_next_to_them_at_nearly_one_time(t
     assert [(c.first, c.second) for c in compared] == [(0, 3), (1, 2), (2, 3)]
     assert all(a[1:] == b[1:] and (int(a[0]), int(b[0])) == (c[0], c[1]) for c in compared for a, b in c.frames)
     assert len(cameras_to_compare(capture, 2)) == 2
+
+
+def test_cameras_are_not_compared_while_one_of_them_does_not_film(tmp_path):
+    """Camera 1 begins half of the time later: only frames from then on are compared, but for one interval."""
+    capture = load_capture(write_rig(tmp_path / "rig", [-0.4, 0.4]))
+    names = capture.by_camera(capture.train)
+    later = {name: replace(capture.cameras[name], time=capture.cameras[name].time + 0.5) for name in names[1]}
+    interval = capture.cameras[names[1][1]].time - capture.cameras[names[1][0]].time
+    ((_, _, frames),) = cameras_to_compare(capture.with_cameras(later), 12)
+    apart = [abs(capture.with_cameras(later).cameras[b].time - capture.cameras[a].time) for a, b in frames]
+    assert len(apart) > 0
+    assert max(apart) <= interval + 1e-6
+    after = {name: replace(camera, time=camera.time + 9.0) for name, camera in later.items()}
+    assert cameras_to_compare(capture.with_cameras(after), 12)[0].frames == []
 
 
 def test_one_camera_is_not_compared(tmp_path):

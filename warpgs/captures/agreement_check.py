@@ -32,6 +32,10 @@ MIN_BASELINE = 1e-3
 """Distance of two cameras over that of the two farthest ones, below which they have no epipolar lines."""
 
 
+EPSILON = 1e-6
+"""What rounding may add to a time in [0, 1]."""
+
+
 class Compared(NamedTuple):
     """Two cameras to compare, and pairs of their frames, each of nearly one time."""
 
@@ -67,9 +71,15 @@ def cameras_to_compare(capture: Capture, max_count: int) -> list[Compared]:
 def _at_one_time(
     capture: Capture, first: Sequence[str], second: Sequence[str], min_baseline: float
 ) -> list[tuple[str, str]]:
-    """Each frame of a camera with the one of another camera that is nearest in time, if they are apart."""
+    """Each frame of a camera with the one of another that is nearest in time, at most an interval of the latter away.
+
+    While a camera films, it is at most half an interval away; where a frame is missing, a whole one. Pairs whose
+    cameras are at one place are omitted.
+    """
     times = np.array([capture.cameras[name].time for name in second])
-    pairs = [(a, second[int(np.abs(times - capture.cameras[a].time).argmin())]) for a in first]
+    interval = float(np.median(np.diff(times))) if len(times) > 1 else capture.interval
+    nearest = [(a, np.abs(times - capture.cameras[a].time)) for a in first]
+    pairs = [(a, second[int(away.argmin())]) for a, away in nearest if away.min() <= interval + EPSILON]
     centers = {name: capture.cameras[name].position for pair in pairs for name in pair}
     return [(a, b) for a, b in pairs if float((centers[a] - centers[b]).norm()) > min_baseline]
 
@@ -96,7 +106,7 @@ def check_agreement(capture: Capture, compared: Sequence[Compared]) -> Iterator[
         text = f"what they both see is {np.median(distances):.2f} px off their epipolar lines (median)"
         yield Finding("note", "cameras", f"cameras {few_of(agreeing)} agree: {text}")
     if unknown:
-        yield Finding("note", "cameras", f"cameras {few_of(unknown)} see too little alike to be compared")
+        yield Finding("note", "cameras", f"cameras {few_of(unknown)} see too little alike at one time to be compared")
 
 
 def _distance(capture: Capture, pairs: Sequence[tuple[str, str]]) -> float | None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 
 from warpgs.cameras import Camera, are_comparable
@@ -39,10 +40,16 @@ MIN_DIFFERENCE = 0.2
 
 
 def pairs_to_compare(capture: Capture, max_count: int) -> list[tuple[str, str]]:
-    """Training frames that one camera took one after the other in similar directions, evenly spread in time."""
+    """Training frames that one camera took one after the other in similar directions, evenly spread in time.
+
+    Half of them are of cameras that move, if there are any: only these tell whether poses are right.
+    """
     cameras = capture.cameras
     pairs = [(a, b) for a, b in capture.neighbours(capture.train) if are_comparable(cameras[a], cameras[b])]
-    return evenly_spaced(pairs, max_count)
+    still = [(a, b) for a, b in pairs if _stands_still(cameras[a], cameras[b])]
+    moving = [pair for pair in pairs if pair not in {*still}]
+    chosen = evenly_spaced(moving, max(max_count - len(still), -(-max_count // 2)))
+    return [*chosen, *evenly_spaced(still, max_count - len(chosen))]
 
 
 @dataclass(frozen=True)
@@ -52,10 +59,12 @@ class Motion:
     Attributes:
         static: Median of the pixels that the mask marks as static.
         dynamic: Median of the other pixels; None if there are too few.
+        stands_still: Whether both frames have one pose.
     """
 
     static: float
     dynamic: float | None
+    stands_still: bool = False
 
 
 def motion_between(first: Frame, second: Frame) -> Motion | None:
@@ -90,7 +99,7 @@ def motion_between(first: Frame, second: Frame) -> Motion | None:
     if len(values[0]) < MIN_PIXELS:
         return None
     dynamic = float(np.median(values[1])) if len(values[1]) >= MIN_PIXELS else None
-    return Motion(float(np.median(values[0])), dynamic)
+    return Motion(float(np.median(values[0])), dynamic, _stands_still(first.camera, second.camera))
 
 
 def motions_of(capture: Capture, pairs: Sequence[tuple[str, str]]) -> list[Motion]:
@@ -105,10 +114,7 @@ def check_motion(motions: Sequence[Motion], meaning: str) -> Iterator[Finding]:
         text = "frames that follow each other are seen from cameras too far apart, or have too little texture"
         yield Finding("note", "cameras", f"{text}, to compare their motion")
         return
-    static = float(np.median([motion.static for motion in motions]))
-    level: Level = "warning" if static > MAX_EPIPOLAR_DISTANCE else "note"
-    hint = ": the cameras may not match the images" if level == "warning" else ""
-    yield Finding(level, "cameras", f"static pixels are {static:.2f} px off their epipolar lines (median){hint}")
+    yield from _check_poses(motions)
     found = _compare_regions(motions)
     if found is not None and found.are_inverted:
         text = f"static regions of the masks move more than dynamic ones: the masks may be inverted ({meaning})"
@@ -116,6 +122,23 @@ def check_motion(motions: Sequence[Motion], meaning: str) -> Iterator[Finding]:
     elif found is not None:
         text = f"dynamic pixels are farther off their epipolar lines than static ones in {found.more:.0%} of the frames"
         yield Finding("note", "masks", text)
+
+
+def _check_poses(motions: Sequence[Motion]) -> Iterator[Finding]:
+    """Compares cameras that move with the motion in the images, and says whether others really stand still."""
+    wrong = ": the cameras may not match the images"
+    if moving := [motion.static for motion in motions if not motion.stands_still]:
+        static = float(np.median(moving))
+        level: Level = "warning" if static > MAX_EPIPOLAR_DISTANCE else "note"
+        text = f"static pixels are {static:.2f} px off their epipolar lines (median)"
+        yield Finding(level, "cameras", text + wrong * (level == "warning"))
+    if still := [motion.static for motion in motions if motion.stands_still]:
+        static = float(np.median(still))
+        if static > MAX_EPIPOLAR_DISTANCE:
+            text = f"static pixels move by {static:.2f} px (median) where frames have one pose"
+            yield Finding("warning", "cameras", text + wrong)
+        elif not moving:
+            yield Finding("note", "cameras", "no camera moves: motion in the images says nothing about their poses")
 
 
 def confirm_masks(motions: Sequence[Motion]) -> bool:
@@ -147,6 +170,10 @@ class _Regions(NamedTuple):
     def are_right(self) -> bool:
         """Whether the cameras fit the static regions better."""
         return self.more > 0.75 and self.difference > MIN_DIFFERENCE and self.static < MAX_EPIPOLAR_DISTANCE
+
+
+def _stands_still(first: Camera, second: Camera) -> bool:
+    return torch.equal(first.viewmat, second.viewmat)
 
 
 def _compare_regions(motions: Sequence[Motion]) -> _Regions | None:
