@@ -1,13 +1,14 @@
-"""Gains of several cameras, from the colours of points."""
+"""Gains of several cameras, and how they drift, from the colours of points."""
 
 import dataclasses
+import re
 
 import pytest
 import torch
 
 from tests import tiny
 from warpgs.captures.opening import load_capture
-from warpgs.data.responses import camera_responses, in_response
+from warpgs.data.responses import Response, camera_responses, in_response
 from warpgs.evaluation.evaluate import evaluate
 from warpgs.initialization.prepare_start import prepare_start
 from warpgs.rendering import Layer, Rendering
@@ -33,6 +34,7 @@ def with_gains(capture, gains):
     def read(name):
         frame = capture.frame(name)
         gain = gains.get(frame.camera.id, torch.ones(3))
+        gain = gain(frame.camera.time) if callable(gain) else gain
         return dataclasses.replace(frame, image=(frame.image * gain).round().clamp(0, 255).byte())
 
     return dataclasses.replace(capture, read=read)
@@ -42,7 +44,7 @@ def test_gains_of_cameras_are_found(plain):
     found = camera_responses(with_gains(plain, GAINS))
     assert {*found} == {*GAINS}
     for i, gain in GAINS.items():
-        assert found[i].tolist() == pytest.approx(gain.tolist(), rel=0.03)
+        assert found[i].at(0.5).tolist() == pytest.approx(gain.tolist(), rel=0.03)
 
 
 def test_cameras_that_are_alike_have_no_gains(plain):
@@ -71,15 +73,72 @@ def test_a_camera_that_shares_no_points_keeps_its_gain(plain):
 
 def test_saturated_pixels_do_not_count(plain):
     found = camera_responses(with_gains(plain, {3: torch.full((3,), 1.5)}))
-    assert found[3].tolist() == pytest.approx([1.5] * 3, rel=0.04)
+    assert found[3].at(0.0).tolist() == pytest.approx([1.5] * 3, rel=0.04)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """Three cameras with 12 frames each, and one to evaluate."""
+    size = dataclasses.replace(SIZE, num_frames=12, width=96, height=54)
+    capture = load_capture(rig_capture(tmp_path_factory.mktemp("drift"), size, quiet=True))
+    cameras = capture.by_camera([*capture.train, *capture.val])
+    return capture.split([*cameras[1], *cameras[2], *cameras[3]], cameras[0])
+
+
+def drift(time: float) -> torch.Tensor:
+    """20 % over time, in red most at last."""
+    return torch.tensor([0.9 + 0.2 * time**2, 0.9 + 0.2 * time, 0.9 + 0.2 * time])
+
+
+def error_of(response: Response, expected) -> float:
+    """Largest relative error at 24 times."""
+    times = [k / 23 for k in range(24)]
+    return max(float((response.at(time) / expected(time) - 1.0).abs().max()) for time in times)
+
+
+def test_a_camera_that_drifts_is_found_whether_it_trains_or_evaluates(filmed):
+    for i in (2, 0):
+        found = camera_responses(with_gains(filmed, {i: drift}))
+        assert {*found} == {i}
+        assert error_of(found[i], drift) < 0.02
+
+
+def test_light_that_changes_for_all_cameras_stays(filmed):
+    assert camera_responses(with_gains(filmed, dict.fromkeys(range(4), drift))) == {}
+
+
+def test_frames_of_one_camera_say_nothing_of_another(filmed):
+    """Two cameras drift in opposite directions."""
+    found = camera_responses(with_gains(filmed, {1: drift, 2: lambda time: 1.0 / drift(time)}))
+    assert error_of(found[1], drift) < 0.02
+    assert error_of(found[2], lambda time: 1.0 / drift(time)) < 0.02
+
+
+def test_a_jump_is_not_part_of_a_drift(filmed):
+    """It is divided out frame by frame."""
+
+    def jumps(time: float) -> torch.Tensor:
+        return drift(time) * (1.4 if 0.2 < time < 0.4 else 1.0)
+
+    recorded = with_gains(filmed, {2: jumps})
+    assert error_of(camera_responses(recorded)[2], drift) < 0.03
+    start = prepare_start(dataclasses.replace(tiny.CONFIG, exposure=True), recorded)
+    assert any(
+        re.match(r"camera 2 is divided by its gain of 0\.\d\d, .* at first to 1\.\d\d, ", n) for n in start.notes
+    )
+    for k, name in enumerate(filmed.train):
+        truth = filmed.frame(name).image.float() / 255.0
+        known = (truth > 0.1) & (truth < 0.6)
+        assert float((start.views[k].image / truth)[known].median()) == pytest.approx(1.0, abs=0.03)
 
 
 def test_training_divides_gains_out_and_says_so(folder, plain):
     config = dataclasses.replace(tiny.CONFIG, data=folder, exposure=True)
-    start = prepare_start(config, with_gains(plain, GAINS))
+    start = prepare_start(config, with_gains(plain, GAINS | {0: torch.full((3,), 0.8)}))
     told = [note for note in start.notes if "its gain of" in note]
     assert [note.split(" is ")[0] for note in told] == ["camera 2", "camera 4"]
-    assert "camera 0 trains nothing: it is evaluated with the median gain, 1" in start.notes
+    text = "camera 0 trains nothing: its own frames tell the gain that it is evaluated with, 0.8"
+    assert [note[: len(text)] for note in start.notes if note.startswith("camera 0")] == [text]
     for k, name in enumerate(plain.train):
         expected = plain.frame(name).image.float() / 255.0
         assert float((start.views[k].image - expected).abs().median()) < 0.02
@@ -101,8 +160,10 @@ def test_a_rendering_is_compared_as_its_camera_records_it(plain):
         def play(self, camera):
             return self.render(camera).joint.image
 
-    frame = capture.frame(capture.val[0])
-    assert torch.equal(in_response(torch.ones(2, 2, 3), frame, GAINS), GAINS[2].expand(2, 2, 3))
-    without, with_gain = (evaluate(Perfect(), capture, quiet=True, gains=g).summary()["psnr"] for g in ({}, GAINS))
+    frame, responses = capture.frame(capture.val[0]), {i: Response.constant(gain) for i, gain in GAINS.items()}
+    assert torch.allclose(in_response(torch.ones(2, 2, 3), frame, responses), GAINS[2].expand(2, 2, 3))
+    without, with_gain = (
+        evaluate(Perfect(), capture, quiet=True, responses=r).summary()["psnr"] for r in ({}, responses)
+    )
     assert without < 25.0
     assert with_gain > 35.0

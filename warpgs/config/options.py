@@ -75,8 +75,8 @@ class TrainConfig:
     """What stage II no longer optimizes of static Gaussians: positions, scales and rotations (geometry), w⁰, to which
     residuals are added (appearance), or both (all; paper)."""
     exposure: bool = True
-    """Divide jumps of exposure and white balance between frames, and the gains of several cameras, out of the training
-    images, and evaluate frames with the gain of their camera."""
+    """Divide jumps of exposure and white balance between frames, and the gains of several cameras and their drift, out
+    of the training images, and evaluate frames with the gain of their camera."""
     antialias: bool = True
     """Compensate opacities for the low-pass filter (Mip-Splatting)."""
     max_alpha: Annotated[float, ALPHA_BOUNDS] = RenderSettings.max_alpha

@@ -15,7 +15,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.responses import in_response
+from warpgs.data.responses import Response, in_response
 from warpgs.files import write_text
 from warpgs.rendering import Rendering
 
@@ -84,7 +84,7 @@ def evaluate(
     on_view: OnView | None = None,
     align: Callable[[Frame], Camera] | None = None,
     quiet: bool = False,
-    gains: Mapping[int, Tensor] = MappingProxyType({}),
+    responses: Mapping[int, Response] = MappingProxyType({}),
 ) -> Evaluation:
     """Compares a scene with every evaluation frame of a capture.
 
@@ -97,7 +97,7 @@ def evaluate(
         on_view: Called with each view.
         align: The camera to render a frame through, on the scene's device; the frame's own if None.
         quiet: Whether to hide the progress bar.
-        gains: As of ``camera_responses``: renderings are compared as the camera of a frame records them.
+        responses: As of ``camera_responses``: renderings are compared as the camera of a frame records them.
     """
     device = scene.device
     views = []
@@ -106,7 +106,7 @@ def evaluate(
         camera = frame.camera.to(device) if align is None else align(frame)
         truth = frame.image.to(device).float() / 255.0
         rendering, shown = scene.render(camera, branches=True), camera.shown
-        recorded = in_response(rendering.joint.image, frame, gains)
+        recorded = in_response(rendering.joint.image, frame, responses)
         rendering = rendering._replace(joint=rendering.joint._replace(image=recorded))
         if shown is not None:
             rendering = rendering._replace(joint=rendering.joint.only_where(shown, truth))

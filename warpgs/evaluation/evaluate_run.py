@@ -65,10 +65,10 @@ def evaluate_run(
     capture = capture or run.open_capture(quiet)
     scene = run.trained_scene()
     require_same_times(capture, scene.metadata)
-    gains = camera_responses(capture) if run.config.exposure else {}
-    save_image, align = _image_writer(run, len(capture.val)), alignment(scene, capture.median_depth, gains)
+    responses = camera_responses(capture) if run.config.exposure else {}
+    save_image, align = _image_writer(run, len(capture.val)), alignment(scene, capture.median_depth, responses)
     network = network and network.to(scene.device)
-    evaluation = evaluate(scene, capture, network, save_image, align, quiet, gains)
+    evaluation = evaluate(scene, capture, network, save_image, align, quiet, responses)
     values = {**evaluation.summary(), "device": device_name(scene.device), **_of_run(scene, capture)}
     _write_metrics(run, {**known, **values, "commit": commit()}, evaluation)
     _write_video(folder / "time.mp4", scene, capture, quiet)  # last: metrics need no FFmpeg

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.data.capture import Frame
-from warpgs.data.responses import camera_responses, in_response
+from warpgs.data.responses import Response, camera_responses, in_response
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.errors import one_line
 from warpgs.runs.logger import TrainingLogger
@@ -28,10 +28,10 @@ HELD_OUT_WIDTH = 320
 
 @torch.no_grad()
 def render_and_compare(
-    scene: TrainedScene, frame: Frame, gains: Mapping[int, Tensor] = MappingProxyType({})
+    scene: TrainedScene, frame: Frame, responses: Mapping[int, Response] = MappingProxyType({})
 ) -> tuple[Float[Tensor, "H W 3"], float]:
     """The joint image as a frame's camera records it by its gain, and its PSNR [dB]."""
-    image = in_response(scene.render(frame.camera).joint.image, frame, gains).clamp(0, 1)
+    image = in_response(scene.render(frame.camera).joint.image, frame, responses).clamp(0, 1)
     return image, psnr(image, frame.image.to(image.device).float() / 255.0, frame.camera.to(image.device).shown)
 
 
@@ -44,7 +44,7 @@ class HeldOut:
     def __init__(self, logger: TrainingLogger) -> None:
         self._logger, self._next = logger, 0
         self._has_truth = self._failed = False
-        self._gains: Mapping[int, Tensor] | None = None
+        self._responses: Mapping[int, Response] | None = None
 
     @torch.no_grad()
     def __call__(self, progress: Progress) -> None:
@@ -56,14 +56,14 @@ class HeldOut:
         values = []
         try:
             frames = [progress.capture.frame(names[k]) for k in evenly_spaced_indices(len(names), HELD_OUT_VIEWS)]
-            if self._gains is None:
-                self._gains = camera_responses(progress.capture) if progress.scene.config.exposure else {}
+            if self._responses is None:
+                self._responses = camera_responses(progress.capture) if progress.scene.config.exposure else {}
         except (ValueError, OSError) as error:
             self._logger.log(f"warning: without held-out views in TensorBoard: {one_line(error)}")
             self._failed = True
             return
         for frame in frames:
-            image, value = render_and_compare(progress.scene, frame, self._gains)
+            image, value = render_and_compare(progress.scene, frame, self._responses)
             values.append(value)
             self._logger.add_image(f"held-out/{frame.name}", reduced(to_bytes(image), HELD_OUT_WIDTH), iteration)
             if not self._has_truth:

@@ -12,6 +12,7 @@ from torch.nn.functional import huber_loss
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
 from warpgs.data.capture import Frame
+from warpgs.data.responses import Response
 from warpgs.least_squares import Problem, minimize
 from warpgs.model.poses import PoseCorrections
 from warpgs.model.splats import Splats
@@ -37,13 +38,13 @@ Errors = Callable[[Float[Tensor, "6"]], Float[Tensor, " M"]]
 """Errors of an image from a pose: its rotation and translation."""
 
 
-def alignment(scene: TrainedScene, unit: float, gains: Mapping[int, Tensor] = MappingProxyType({})) -> Align:
+def alignment(scene: TrainedScene, unit: float, responses: Mapping[int, Response] = MappingProxyType({})) -> Align:
     """Aligns the cameras of frames if poses were corrected in training, else only moves them to the scene's device.
 
     Args:
         scene: The scene.
         unit: Length of a unit of translation: the median depth of the capture [scene units].
-        gains: As of ``camera_responses``: frames are divided by that of their camera.
+        responses: As of ``camera_responses``: frames are divided by that of their camera.
     """
 
     def align(frame: Frame) -> Camera:
@@ -51,8 +52,8 @@ def alignment(scene: TrainedScene, unit: float, gains: Mapping[int, Tensor] = Ma
         if not scene.config.optim.poses:
             return camera
         truth = frame.image.to(scene.device).float() / 255.0
-        if (gain := gains.get(camera.id)) is not None:
-            truth = truth / gain.to(scene.device)
+        if (response := responses.get(camera.id)) is not None:
+            truth = truth / response.at(camera.time).to(scene.device)
         region = camera.shown if frame.covisible is None else frame.covisible.to(scene.device)
         return aligned_camera(scene.splats(camera.time), camera, truth, unit, scene.config.render_settings, region)
 

@@ -7,12 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.data.capture import Frame
-from warpgs.data.responses import BRIGHTEST, DARKEST
+from warpgs.data.responses import BRIGHTEST, DARKEST, MIN_JUMP
 from warpgs.views.views import Views
-
-MIN_JUMP = 0.1
-"""Minimum change of the logarithm of intensities between two frames that counts as a jump, about a third of a stop. The
-appearance network represents slow changes; dividing them out would only hide them from held-out frames."""
 
 WIDTH = 64
 """Frames are compared at this width [px], at which a few pixels of camera motion do not matter."""
@@ -26,7 +22,8 @@ def exposure_gains(views: Views) -> Float[Tensor, "T 3"]:
 
     Intensities are multiplied by about a constant when a camera's exposure or white balance jumps. In the order of
     time, each frame is compared with the one before of its camera: the median of the ratio of their static pixels.
-    Ratios close to 1 are taken as 1, so that gradual changes stay.
+    Ratios close to 1 are taken as 1, so that gradual changes stay: of one camera, the appearance network represents
+    them, and dividing them out would only hide them from held-out frames; of several, see ``camera_responses``.
 
     Returns:
         [T, 3] factors of red, green and blue, in the order of the views; their median over frames of a camera is 1.

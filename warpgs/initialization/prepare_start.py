@@ -81,19 +81,21 @@ def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
 
 
 def _even_exposure(start: Start) -> Start:
-    """Divides gains of cameras and jumps of exposure out of the images."""
+    """Divides gains of cameras, as they drift, and jumps of exposure out of the images."""
     gains, notes, capture = exposure_gains(start.views), [], start.capture
     if count := int((gains != 1.0).any(1).sum()):
         low, high = gains.min().item(), gains.max().item()
         notes.append(f"exposure jumps: {count} frames are divided by {low:.2f} to {high:.2f}")
     trained, responses = {*capture.by_camera(capture.train)}, camera_responses(capture)
-    for i, gain in responses.items():
-        of_camera = torch.tensor([capture.cameras[name].id == i for name in capture.train])
-        gains[of_camera] *= gain
-        red, green, blue = gain.tolist()
-        notes.append(f"camera {i} is divided by its gain of {red:.2f}, {green:.2f}, {blue:.2f} (red, green, blue)")
-    if responses and (others := [i for i in capture.by_camera(capture.val) if i not in trained]):
-        notes.append(f"camera {', '.join(map(str, others))} trains nothing: it is evaluated with the median gain, 1")
+    for i, response in responses.items():
+        told = f"{response} (red, green, blue)"
+        if i in trained:
+            notes.append(f"camera {i} is divided by its gain of {told}")
+        else:
+            notes.append(f"camera {i} trains nothing: its own frames tell the gain that it is evaluated with, {told}")
+    for k, camera in enumerate(capture.cameras[name] for name in capture.train):
+        if camera.id in responses:
+            gains[k] *= responses[camera.id].at(camera.time)
     if notes:  # saves steps a division
         start.views.divide_by(gains)
     return start.noted(*notes)

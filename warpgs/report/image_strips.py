@@ -74,8 +74,8 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
     """
     run = Run.open(evaluated.folder, device)
     capture, scene = run.open_capture(quiet), run.trained_scene()
-    gains = camera_responses(capture) if run.config.exposure else {}
-    align = alignment(scene, capture.median_depth, gains)
+    responses = camera_responses(capture) if run.config.exposure else {}
+    align = alignment(scene, capture.median_depth, responses)
     strips = {}
     for name in progress(names, f"rendering {evaluated.label}", quiet):
         if name not in capture.cameras:
@@ -83,7 +83,7 @@ def rendered_strips(evaluated: EvaluatedRun, names: Sequence[str], device: Devic
         frame = capture.frame(name)
         truth = frame.image.to(scene.device).float() / 255.0
         rendering = scene.render(align(frame), branches=True)
-        joint = rendering.joint._replace(image=in_response(rendering.joint.image, frame, gains))
+        joint = rendering.joint._replace(image=in_response(rendering.joint.image, frame, responses))
         layers = (joint, rendering.static, rendering.dynamic)
         shown = [to_bytes(layer.image) for layer in layers if layer is not None]
         error = error_image(joint.image.clamp(0, 1), truth)
