@@ -169,6 +169,43 @@ def test_edits_that_leave_nothing_are_undone_with_a_reason(cleanup):
     assert note(cleanup).startswith("edits leave no Gaussian")
 
 
+def test_an_edit_that_is_made_while_another_is_refused_stays(cleanup, monkeypatch):
+    edited = cleanup.source.edited
+
+    def slowly(edits):
+        if edits.min_opacity == 1.0:
+            cleanup.controls.opacity.value = 0.2
+        return edited(edits)
+
+    monkeypatch.setattr(cleanup.source, "edited", slowly)
+    cleanup.controls.opacity.value = 1.0
+    cleanup.scene()
+    assert cleanup.edits == Edits(min_opacity=0.2)
+    assert note(cleanup).startswith("edits leave no Gaussian")
+    cleanup.controls.undo.click()
+    assert cleanup.edits == Edits()
+
+
+def test_undo_does_not_return_to_edits_that_were_refused(cleanup, monkeypatch):
+    edited = cleanup.source.edited
+
+    def slowly(edits):
+        if edits == Edits(min_opacity=1.0):
+            cleanup.controls.crop.value = True
+            cleanup.controls.opacity.value = 0.2
+        return edited(edits)
+
+    monkeypatch.setattr(cleanup.source, "edited", slowly)
+    cleanup.controls.opacity.value = 1.0
+    cleanup.scene()
+    undone = []
+    while cleanup.edits != Edits():
+        cleanup.controls.undo.click()
+        undone.append(cleanup.edits)
+    assert len(undone) == 2
+    assert Edits(min_opacity=1.0) not in undone
+
+
 @pytest.mark.parametrize("position", [(np.nan, 0.0, 0.0), (1e30, 0.0, 0.0)])
 def test_positions_that_no_box_has_are_refused(cleanup, position):
     cleanup.controls.crop.value = True

@@ -93,7 +93,7 @@ class Cleanup:
                 with self._rendering:
                     self._shown = edits, self._source.edited(edits)
             except ValueError as error:
-                self._undo(one_line(error))
+                self._refuse(edits, one_line(error))
                 return scene if self._shown is None else self._shown[1]
         return self._shown[1]
 
@@ -121,13 +121,20 @@ class Cleanup:
             self._set_controls()
         self._wake()
 
-    def _undo(self, reason: str = "") -> None:
+    def _undo(self) -> None:
         with self._lock:
             self.edits = self._before.pop() if self._before else self._source.edits
             self._last = ""
             self._set_controls()
-            if reason:
-                self._note(reason)
+        self._wake()
+
+    def _refuse(self, refused: Edits, reason: str) -> None:
+        """Undoes edits that cannot be made; those that were made while they were tried stay, to be tried next."""
+        with self._lock:
+            self._before = [edits for edits in self._before if edits != refused]
+            if self.edits == refused:
+                self._undo()
+            self._note(reason)
         self._wake()
 
     def _save(self) -> None:
