@@ -139,6 +139,14 @@ def test_all_edits_can_be_given_on_the_command_line(run, capsys):
     assert "edits keep 30 of " in capsys.readouterr().out
 
 
+def test_a_switch_that_is_given_as_off_replaces_the_one_in_the_file(run, capsys):
+    save_edits(run, Editing(), Edits(drop_floaters=True, max_gaussians=9))
+    assert main(["export", str(run), "--quiet", "--no-drop-floaters", "--save-edits"]) == 0
+    assert read_edits(run / NAME) == Edits(max_gaussians=9)
+    assert main(["export", str(run), "--quiet", "--drop-floaters", "--save-edits"]) == 0
+    assert read_edits(run / NAME) == Edits(drop_floaters=True, max_gaussians=9)
+
+
 def test_floaters_need_the_capture(run, tmp_path, capsys):
     edit_json(run / "config.json", data=str(tmp_path / "gone"))
     assert main(["export", str(run), "--quiet", "--drop-floaters"]) == 2

@@ -92,9 +92,30 @@ def parse(options: type[Options], arguments: Sequence[str], prog: str) -> Option
         SystemExit: After ``--help``.
     """
     # Help is of the whole command: tyro leaves out the positional arguments that are given.
-    rest = ["--help"] if {"-h", "--help"} & {*arguments} else list(arguments)
+    rest = ["--help"] if {"-h", "--help"} & {*arguments} else _with_values(options, arguments)
     with one_line_errors(options, arguments, prog), described(options):
         return tyro.cli(options, args=rest, prog=prog)
+
+
+def _with_values(options: type, arguments: Sequence[str]) -> list[str]:
+    """The arguments, with a value after each switch that is neither on nor off unless given, as tyro expects it."""
+    on = {f"--{name}" for name in open_switches(options)}
+    off = {f"--no-{name[2:]}": name for name in on}
+    values = []
+    for argument in arguments:
+        name = argument.replace("_", "-")
+        values += [name, "True"] if name in on else [off[name], "False"] if name in off else [argument]
+    return values
+
+
+def open_switches(options: type) -> Iterator[str]:
+    """Names on the command line of the fields ``bool | None``, without prefixes."""
+    for name, hint in typing.get_type_hints(options, include_extras=True).items():
+        plain = _plain(hint)
+        if dataclasses.is_dataclass(plain):
+            yield from open_switches(typing.cast(type, plain))
+        elif _is_open_switch(hint):
+            yield _shown(name, hint)
 
 
 @contextlib.contextmanager
@@ -224,7 +245,7 @@ def described(options: type, shown: Collection[str] | None = None) -> Iterator[N
             elif dataclasses.is_dataclass(plain):
                 stack.enter_context(described(typing.cast(type, plain)))
             else:
-                options.__annotations__[name] = _with_help(hint, texts.get(name, ""))
+                options.__annotations__[name] = _with_help(name, hint, texts.get(name, ""))
         yield
 
 
@@ -239,12 +260,16 @@ def docstrings(options: type) -> dict[str, str]:
     return texts
 
 
-def _with_help(hint: Any, text: str) -> Any:
-    given = _settings(hint)
-    name, metavar = (given.name, given.metavar) if given else (None, None)
-    metavar = metavar or _metavar(_plain(hint))
-    default = "" if "the default is" in text else _default_hint
-    return Annotated[hint, tyro.conf.arg(name=name, metavar=metavar, help=text, help_behavior_hint=default)]
+def _with_help(field: str, hint: Any, text: str) -> Any:
+    given, settings = _settings(hint), dict[str, Any](help=text)
+    settings["name"], metavar = (given.name, given.metavar) if given else (None, None)
+    settings["metavar"] = metavar or _metavar(_plain(hint))
+    settings["help_behavior_hint"] = "" if "the default is" in text else _default_hint
+    if _is_open_switch(hint):  # shown as other switches are: tyro names aliases first
+        shown = _shown(field, hint)
+        settings |= {"metavar": "", "name": f"no-{shown}", "aliases": (f"--{shown}",)}
+        settings["help_behavior_hint"] = "(default: no)"
+    return Annotated[hint, tyro.conf.arg(**settings)]
 
 
 def _metavar(plain: Any) -> str | None:
@@ -276,6 +301,11 @@ def _shown(name: str, hint: Any) -> str:
     """The name of a field on the command line; empty for a dataclass whose options have no prefix."""
     settings = _settings(hint)
     return name.replace("_", "-") if settings is None or settings.name is None else settings.name
+
+
+def _is_open_switch(hint: Any) -> bool:
+    """Whether an annotation is ``bool | None``: a switch that is neither on nor off unless given."""
+    return bool(hint == (bool | None))
 
 
 def _plain(hint: Any) -> Any:

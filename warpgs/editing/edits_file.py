@@ -34,9 +34,9 @@ def edits_in_use(folder: Path, editing: Editing) -> Edits:
     path = editing.edits or folder / NAME
     if path == NONE or (editing.edits is None and not path.exists()):
         return editing.given
-    return dataclasses.replace(
-        read_edits(path), **{name: getattr(editing.given, name) for name in _names(editing.given)}
-    )
+    given = {name: getattr(editing.given, name) for name in _names(editing.given)}
+    edits = dataclasses.replace(read_edits(path), **given)
+    return dataclasses.replace(edits, drop_floaters=edits.drop_floaters or None)
 
 
 def save_edits(folder: Path, editing: Editing, edits: Edits) -> Path:

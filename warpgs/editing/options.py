@@ -19,7 +19,7 @@ class Edits:
     coordinates of the scene."""
     min_opacity: float | None = None
     """Remove the Gaussians whose opacity is lower than this at all times, in [0, 1]."""
-    drop_floaters: bool = False
+    drop_floaters: bool | None = None
     """Remove floaters: isolated Gaussians that the training cameras see little of."""
     max_gaussians: int | None = None
     """Keep at most this many Gaussians: those that the training cameras see most of."""

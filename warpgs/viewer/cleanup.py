@@ -79,7 +79,7 @@ class Cleanup:
         controls.opacity.on_update(
             lambda _: self._change("min_opacity", clamped(controls.opacity.value, OPACITIES) or None)
         )
-        controls.floaters.on_update(lambda _: self._change("drop_floaters", bool(controls.floaters.value)))
+        controls.floaters.on_update(lambda _: self._change("drop_floaters", bool(controls.floaters.value) or None))
         controls.undo.on_click(lambda _: self._undo())
         controls.save.on_click(lambda _: self._save())
 
@@ -172,7 +172,7 @@ class Cleanup:
             if edits.crop is not None:
                 set_value(corner, edits.crop[3 * k : 3 * k + 3])
         set_value(controls.opacity, edits.min_opacity or 0.0)
-        set_value(controls.floaters, edits.drop_floaters)
+        set_value(controls.floaters, bool(edits.drop_floaters))
         self._is_setting = False
         made = [name for name in ("crop", "min_opacity", "drop_floaters", "max_gaussians") if getattr(edits, name)]
         self._note(", ".join(made) or "no edits")
