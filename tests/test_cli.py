@@ -154,7 +154,7 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["train", "--device", "x"], "warpgs train: --device must be one of cpu, cuda, got 'x'\n"),
         (
             ["render", "r", "--layers", "it's"],
-            "warpgs render: --layers must be one of all, alpha, depth, dynamic, joint, static, got ",
+            "warpgs render: --layers must be one of all, alpha, depth, dynamic, joint, objects, static, got ",
         ),
         (
             ["train", "--factor", "2", "capture"],

@@ -4,6 +4,7 @@ import json
 import shutil
 
 import pytest
+import torch
 
 from tests.data.captures import edit_json
 from tests.export.scenes import refusal
@@ -17,7 +18,18 @@ from warpgs.viewer.source import open_source
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
-ALL = Edits(crop=(-1.0, -2.0, 0.5, 1.0, 2.0, 3.25), min_opacity=0.05, drop_floaters=True, max_gaussians=7)
+ALL = Edits(
+    box=(("table", -1.0, -2.0, 0.5, 1.0, 2.0, 3.25), ("wall-2", 0.0, 0.0, 0.0, 1.0, 1.0, 1.0)),
+    recolor=(("1", 0.0, 0.5, 1.0),),
+    freeze=(("1", 0.25), ("2", 1.0)),
+    shift=(("3", -0.5),),
+    objects="1,2,table",
+    remove="0",
+    crop=(-1.0, -2.0, 0.5, 1.0, 2.0, 3.25),
+    min_opacity=0.05,
+    drop_floaters=True,
+    max_gaussians=7,
+)
 
 
 @pytest.fixture
@@ -71,7 +83,7 @@ def test_a_file_that_is_named_must_exist(tmp_path):
         ({"format": "gltf"}, "is not a file of edits of warpgs"),
         ({"version": 2}, "has version 2, this program reads 1"),
         ({"version": None}, "has version None"),
-        ({"lasso": []}, "has an unknown edit 'lasso', expected some of crop, "),
+        ({"lasso": []}, "has an unknown edit 'lasso', expected some of box, "),
         ({"crop": [0, 0, 0, 1, 1]}, "crop must be finite numbers of shape"),
         ({"crop": [0, 0, 0, 1, 1, 1e10]}, "crop must be at most"),
         ({"crop": [0, 0, 0, 0, 1, 1]}, "--crop must be opposite corners"),
@@ -80,6 +92,14 @@ def test_a_file_that_is_named_must_exist(tmp_path):
         ({"drop_floaters": 1}, "drop_floaters cannot be 1"),
         ({"max_gaussians": 7.5}, "max_gaussians cannot be 7.5"),
         ({"max_gaussians": True}, "max_gaussians cannot be True"),
+        ({"freeze": 1}, "freeze must be a list of lists"),
+        ({"freeze": ["1"]}, "freeze must be a list of lists"),
+        ({"freeze": [["1"]]}, "freeze must be finite numbers of shape"),
+        ({"freeze": [[1, 0.5]]}, "freeze needs the name of an object, got 1"),
+        ({"freeze": [["1", "0.5"]]}, "freeze must hold numbers"),
+        ({"freeze": [["1", 2]]}, "--freeze 1 must be in"),
+        ({"box": [["table", 0, 0, 0, 1, 1]]}, "box must be finite numbers of shape"),
+        ({"objects": 2}, "objects cannot be 2"),
         ({"max_gaussians": -1}, "--max-gaussians must be at least 1"),
     ],
 )
@@ -118,9 +138,11 @@ def test_without_edits_a_run_is_the_same_bit_for_bit(run):
     whole = count(run)
     main(["export", str(run), "--quiet", "--max-gaussians", "9", "--save-edits"])
     source = open_source(run, "cpu", False)
-    unedited = source.current()
-    assert source.edit(Editing(edits=NONE), None) == []
-    assert source.current() is unedited
+    unedited = source.current().splats(0.3)
+    source.edit(Editing(edits=NONE), None)
+    shown = source.current().splats(0.3)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(shown, name), getattr(unedited, name))
     (run / NAME).unlink()
     assert count(run) == whole
 
@@ -133,8 +155,17 @@ def test_a_training_that_is_followed_has_no_edits(run, capsys):
 def test_all_edits_can_be_given_on_the_command_line(run, capsys):
     box = ["--crop", "-9", "-9", "-9", "9", "9", "9"]
     edits = [*box, "--min-opacity", "0.01", "--drop-floaters", "--max-gaussians", "30", "--save-edits"]
-    assert main(["export", str(run), "--quiet", *edits]) == 0
-    expected = Edits(crop=(-9.0, -9.0, -9.0, 9.0, 9.0, 9.0), min_opacity=0.01, drop_floaters=True, max_gaussians=30)
+    objects = ["--box", "all", *box[1:], "--objects", "0,all", "--recolor", "all", "1", "0.5", "0"]
+    assert main(["export", str(run), "--quiet", *objects, *edits]) == 0
+    expected = Edits(
+        box=(("all", -9.0, -9.0, -9.0, 9.0, 9.0, 9.0),),
+        recolor=(("all", 1.0, 0.5, 0.0),),
+        objects="0,all",
+        crop=(-9.0, -9.0, -9.0, 9.0, 9.0, 9.0),
+        min_opacity=0.01,
+        drop_floaters=True,
+        max_gaussians=30,
+    )
     assert read_edits(run / NAME) == expected
     assert "edits keep 30 of " in capsys.readouterr().out
 

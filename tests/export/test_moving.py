@@ -4,9 +4,12 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from tests.export import scenes
+from warpgs.editing.object_scene import ObjectScene
 from warpgs.export import fourdgs, usd
+from warpgs.export.clouds import Clouds
 from warpgs.export.job import Job
 from warpgs.export.options import Export
 from warpgs.export.orientation import AXES, upright
@@ -120,6 +123,56 @@ def test_a_value_that_changes_late_is_constant_before(tmp_path):
         np.array(prim.GetPositionsAttr().Get(time))[0, 0] - cloud.means[0, 0] for time in (0, 1.5, 2, 2.5, 3, 4.9, 6)
     ]
     assert found == pytest.approx([0, 0, 0, 0.5, 1, 1, 2], abs=1e-5)
+
+
+@pytest.fixture
+def numbered(clouds):
+    """The clouds with objects, whose numbers are those of the Gaussians modulo 3."""
+    ids = torch.arange(60) % 3
+    return Clouds(ObjectScene(clouds.scene, ids)), ids.tolist()
+
+
+def test_usd_has_the_object_of_each_gaussian(numbered, finished_run, tmp_path):
+    pytest.importorskip("pxr.UsdVol", reason="usd-core is not installed (extra 'export')")
+    from pxr import Usd, UsdGeom
+
+    clouds, ids = numbered
+    usd.write_usd(job(clouds, finished_run, tmp_path))
+    stage, found = Usd.Stage.Open(str(tmp_path / "scene.usdc")), []
+    for name in ("static", "dynamic"):
+        primvar = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(f"/Scene/{name}")).GetPrimvar("objectId")
+        assert primvar.GetInterpolation() == UsdGeom.Tokens.vertex
+        found += list(primvar.Get())
+    assert found == ids
+
+
+def test_a_container_has_the_object_of_each_gaussian_at_all_times(numbered, finished_run, tmp_path):
+    pytest.importorskip("fourdgs", reason="fourdgs is not installed (extra 'export')")
+    from fourdgs import keyframe_delta_file as file
+    from fourdgs import opcode
+    from fourdgs.validate import validate
+
+    clouds, ids = numbered
+    fourdgs.write_fourdgs(job(clouds, finished_run, tmp_path, keys=10))  # two keyframes
+    content = (tmp_path / "scene.4dgs").read_bytes()
+    assert validate(content).ok
+    for decoded in (file.decode_streamed(content), file.decode_indexed(content)[0]):
+        assert len(decoded.chunks) == 10
+        for chunk in decoded.chunks:
+            assert chunk.state.bins[opcode.A_OBJECT_ID][:, 0].tolist() == [ids[k] for k in chunk.state.ids]
+
+
+def test_objects_change_nothing_else_of_a_container(numbered, clouds, finished_run, tmp_path):
+    pytest.importorskip("fourdgs", reason="fourdgs is not installed (extra 'export')")
+    from fourdgs import keyframe_delta_file as file
+
+    states = []
+    for name, written in (("with", numbered[0]), ("without", clouds)):
+        fourdgs.write_fourdgs(job(written, finished_run, tmp_path / name, keys=10))
+        content = (tmp_path / name / "scene.4dgs").read_bytes()
+        states.append(file.render_at(file.decode_indexed(content)[0], 0.95 * SECONDS))
+    for name in ("centers", "rotations", "scales", "opacity", "rgb"):
+        assert np.array_equal(states[0][name], states[1][name])
 
 
 @pytest.fixture(scope="module")

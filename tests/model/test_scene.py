@@ -36,7 +36,7 @@ def make_scene(num_static=NUM_STATIC, num_dynamic=NUM_DYNAMIC, trained=True, **c
 
 
 def named(splats):
-    return {name: getattr(splats, name) for name in Splats.tensor_names() if name != "colors"}
+    return {name: getattr(splats, name) for name in Splats.tensor_names() if name not in ("colors", "objects")}
 
 
 def static_part(splats):

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from tests.data.captures import edit_json
@@ -23,6 +24,7 @@ from warpgs.video import command, frames, render_run, writer
 from warpgs.video.camera_paths import training_path
 from warpgs.video.options import Render
 from warpgs.visualize.images import to_bytes
+from warpgs.visualize.objects import objects_image
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -210,6 +212,18 @@ def test_alpha_is_grey(run, capture, scene, tmp_path):
     for name, image in images_in(tmp_path).items():
         alpha = scene.render(capture.cameras[name]).joint.alpha
         assert (image == to_bytes(alpha[..., None].expand(-1, -1, 3))).all()
+
+
+def test_objects_are_those_of_the_run(run, capture, scene, tmp_path):
+    ids = torch.arange(len(scene.scene.dynamic)) % 3
+    np.savez(run / "objects.npz", iteration=scene.metadata.iteration, ids=ids.int().numpy())
+    render(run, tmp_path, layers="objects")
+    objects = torch.cat([torch.zeros(len(scene.scene.static), dtype=torch.int64), ids])
+    for name, image in images_in(tmp_path).items():
+        camera = capture.cameras[name]
+        splats = dataclasses.replace(scene.splats(camera.time), objects=objects)
+        assert (image == objects_image(splats, camera, scene.config.render_settings)).all()
+        assert (image[..., 0] > image[..., 1]).any()
 
 
 def test_depth_has_the_same_colors_in_all_frames(run, monkeypatch, tmp_path):

@@ -12,11 +12,14 @@ import torch
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
+from tests import tiny
 from tests.viewer.test_path_editor import Control
 from warpgs.editing.edits_file import NAME, read_edits
+from warpgs.editing.objects import NAME as OBJECTS
 from warpgs.editing.options import Editing, Edits
 from warpgs.runs.run import Run
 from warpgs.viewer.cleanup import Cleanup, box_edges
+from warpgs.viewer.cleanup_controls import ONLY, REMOVE
 from warpgs.viewer.source import MAX_EDITED, open_source
 
 pytestmark = pytest.mark.usefixtures("contracts_off", "quickly")
@@ -69,7 +72,8 @@ def opened(run, editing=None):
 
 
 def visited(source):
-    controls = SimpleNamespace(**{name: Control() for name in ("crop", "opacity", "floaters", "undo", "save", "note")})
+    names = ("crop", "opacity", "floaters", "object", "choice", "undo", "save", "note")
+    controls = SimpleNamespace(**{name: Control() for name in names})
     controls.corners = [Control((0.0, 0.0, 0.0)) for _ in range(2)]
     woken = []
     made = Cleanup(Scene(), controls, source, threading.Lock(), lambda: woken.append(1))
@@ -204,6 +208,44 @@ def test_undo_does_not_return_to_edits_that_were_refused(cleanup, monkeypatch):
         undone.append(cleanup.edits)
     assert len(undone) == 2
     assert Edits(min_opacity=1.0) not in undone
+
+
+@pytest.fixture
+def with_objects(run):
+    """A browser of a run whose dynamic Gaussians are two objects."""
+    count = len(Run.open(run, "cpu").trained_scene().scene.dynamic)
+    np.savez(run / OBJECTS, iteration=tiny.LENGTH, ids=1 + np.arange(count, dtype=np.int32) % 2)
+    return opened(run)
+
+
+def choose(cleanup, name, choice):
+    cleanup.controls.object.value = name
+    cleanup.controls.choice.value = choice
+    cleanup.controls.choice.click()
+
+
+def test_an_object_is_shown_alone_or_removed(with_objects):
+    assert with_objects.controls.object.options == ("1", "2")
+    whole, dynamic = count(with_objects), len(with_objects.scene().scene.dynamic)
+    choose(with_objects, "2", REMOVE)
+    assert with_objects.edits == Edits(remove="2")
+    assert count(with_objects) == whole - dynamic // 2
+    choose(with_objects, "1", REMOVE)
+    assert count(with_objects) == whole - dynamic
+    with_objects.controls.undo.click()
+    with_objects.controls.undo.click()
+    choose(with_objects, "1", ONLY)
+    assert with_objects.edits == Edits(objects="1")
+    assert count(with_objects) == dynamic - dynamic // 2
+
+
+def test_the_layer_of_objects_needs_no_edits(with_objects):
+    assert {*with_objects.scene().splats(0.5).objects.tolist()} == {0, 1, 2}
+
+
+def test_objects_that_there_are_not_cannot_be_chosen(with_objects):
+    choose(with_objects, "7", REMOVE)
+    assert with_objects.edits == Edits()
 
 
 @pytest.mark.parametrize("position", [(np.nan, 0.0, 0.0), (1e30, 0.0, 0.0)])

@@ -1,5 +1,7 @@
 """The layers that the viewer shows."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -50,6 +52,22 @@ def test_the_dynamic_weight_is_white_on_dynamic_gaussians():
     left, right = sides("dynamic weight")
     assert left == BLACK
     assert min(right) > 200
+
+
+def test_objects_have_colours_of_their_own_and_numbers():
+    numbered = dataclasses.replace(splats(), objects=torch.tensor([2, 1]))
+    left, right = sides("objects", numbered)
+    assert left[1] > 2 * left[0]
+    assert right[0] > 2 * right[1]
+    image = render_layer("objects", numbered, along_z(400.0, (320, 240)))
+    assert (image.min(2) > 230).sum() > 20  # of the numbers
+
+
+def test_what_belongs_to_no_object_is_grey():
+    for scene in (splats(), dataclasses.replace(splats(), objects=torch.tensor([0, 0]))):
+        for color in sides("objects", scene):
+            assert len({*color}) == 1
+            assert 50 < color[0] < 100
 
 
 def test_the_dynamic_weight_omits_hidden_gaussians():

@@ -1,4 +1,4 @@
-"""The scene of a run with its edits: Gaussians are removed from a copy in memory."""
+"""The scene of a run with its edits: objects are changed and Gaussians removed in a copy in memory."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +15,8 @@ from warpgs.video.camera_paths import evenly_spaced
 
 from .contribution import Contribution, contribution, sample_cameras, weakest
 from .edits_file import check, edits_in_use, save_edits
+from .object_scene import ObjectScene, number_of, with_boxes, with_objects
+from .objects import Objects, find_objects, stored_objects
 from .options import Box, Editing, Edits
 
 NUM_TIMES = 9
@@ -27,12 +29,20 @@ NUM_NEIGHBORS = 16
 MIN_ISOLATION = 1.5
 """Isolation from which a Gaussian is isolated (``isolation``)."""
 
+NOTHING = Edits()
+"""No edits."""
+
 Opened = Callable[[], Capture | None]
 """Opens the capture of a run; None if it cannot be opened."""
 
 
 def with_edits(
-    scene: TrainedScene, folder: Path, editing: Editing, open_capture: Opened, quiet: bool = True
+    scene: TrainedScene,
+    folder: Path,
+    editing: Editing,
+    open_capture: Opened,
+    quiet: bool = True,
+    numbered: bool = False,
 ) -> tuple[TrainedScene, list[str]]:
     """A scene with the edits that are in use, which are saved if the options ask for it; and lines about them.
 
@@ -42,14 +52,17 @@ def with_edits(
         editing: The options.
         open_capture: Opens the capture; called only if an edit needs the training cameras.
         quiet: Whether to hide the progress bar.
+        numbered: Whether its splats are to have the numbers of their objects in any case.
 
     Raises:
-        ValueError: As ``edits_in_use`` and ``edited``.
+        ValueError: As ``edits_in_use``, ``stored_objects`` and ``edited``.
         OSError: If edits cannot be saved.
     """
     edits = edits_in_use(folder, editing)
-    before, notes = _number(scene), []
-    if edits != Edits():
+    before, notes = _number(scene), list[str]()
+    if numbered or edits.about_objects:
+        scene, notes = with_ids(scene, folder, edits)
+    if edits != NOTHING:
         capture = open_capture() if edits.drop_floaters or edits.max_gaussians is not None else None
         scene = edited(scene, edits, capture, quiet)
         notes.append(f"edits keep {_number(scene):,} of {before:,} Gaussians")
@@ -58,22 +71,47 @@ def with_edits(
     return scene, notes
 
 
-def edited(scene: TrainedScene, edits: Edits, capture: Capture | None = None, quiet: bool = True) -> TrainedScene:
-    """A scene without the Gaussians that edits remove; the same one if they remove none.
+def with_ids(scene: TrainedScene, folder: Path, edits: Edits = NOTHING) -> tuple[TrainedScene, list[str]]:
+    """A scene whose splats know their objects, and lines about these; a sequence of files has none.
 
     Args:
-        scene: Not changed.
-        edits: What to remove.
+        scene: Of the newest checkpoint, which may know them already.
+        folder: Its run folder.
+        edits: The boxes of static objects, for the lines; ``edited`` adds them to the scene.
+
+    Raises:
+        ValueError: As ``stored_objects`` and ``with_boxes``.
+    """
+    if scene.varies:
+        return scene, []
+    notes = []
+    if not isinstance(scene, ObjectScene):
+        ids, note = stored_objects(scene, folder)
+        scene, notes = with_objects(scene, with_boxes(ids, scene, ()), NOTHING), [note] if note else []
+    return scene, [f"objects: {with_boxes(scene.of_dynamic, scene, edits.box)}", *notes]
+
+
+def edited(scene: TrainedScene, edits: Edits, capture: Capture | None = None, quiet: bool = True) -> TrainedScene:
+    """A scene with changed objects and without the Gaussians that edits remove; the same one if nothing changes.
+
+    Args:
+        scene: Not changed. One of ``with_ids`` is asked for its objects; those of others are found.
+        edits: What to change and to remove.
         capture: Its training cameras see how much each Gaussian contributes. Without it, default cameras do so for
             ``max_gaussians``.
         quiet: Whether to hide the progress bar.
 
     Raises:
-        ValueError: If an edit is out of its range, removes all Gaussians, or needs a capture.
+        ValueError: If an edit is out of its range, names an unknown object, removes all Gaussians, or needs a capture.
     """
     check(edits)
-    if scene.varies and edits != Edits():
+    if scene.varies and edits != NOTHING:
         raise ValueError("a sequence of files cannot be edited: edit its files one by one")
+    if edits.about_objects:
+        ids = scene.of_dynamic if isinstance(scene, ObjectScene) else find_objects(scene)
+        objects = with_boxes(ids, scene, edits.box)
+        changed = with_objects(scene, objects, edits)
+        scene = _kept(changed, _of_objects(changed, objects, edits))
     if edits.crop is not None or edits.min_opacity is not None:
         scene = _kept(scene, _inside_and_opaque(scene, edits))
     if not edits.drop_floaters and (edits.max_gaussians is None or _number(scene) <= edits.max_gaussians):
@@ -134,6 +172,16 @@ def _inside_and_opaque(scene: TrainedScene, edits: Edits) -> Bool[Tensor, " N"]:
     return inside & (opacities >= (edits.min_opacity or 0.0))
 
 
+def _of_objects(scene: ObjectScene, objects: Objects, edits: Edits) -> Bool[Tensor, " N"]:
+    """Which Gaussians belong to the objects to keep."""
+    kept = torch.ones_like(scene.ids, dtype=torch.bool)
+    for option, names, stays in (("objects", edits.objects, True), ("remove", edits.remove, False)):
+        if names is not None:
+            numbers = [number_of(objects, option, name.strip()) for name in names.split(",")]
+            kept &= torch.isin(scene.ids, torch.tensor(numbers, device=scene.device)) == stays
+    return kept
+
+
 def _corners(crop: Box | None, device: torch.device) -> tuple[Tensor, Tensor]:
     """The lowest and the highest corner of a box; of all space without one."""
     corners = torch.tensor(crop or (*[-torch.inf] * 3, *[torch.inf] * 3), dtype=torch.float32, device=device).view(2, 3)
@@ -148,9 +196,7 @@ def _kept(scene: TrainedScene, kept: Bool[Tensor, " N"]) -> TrainedScene:
         means = scene.splats(0.5).means.cpu().numpy()
         low, high = (" ".join(f"{v:.3g}" for v in np.nanquantile(means, q, axis=0)) for q in (0.01, 0.99))
         raise ValueError(f"edits leave no Gaussian; most have their centres between {low} and {high}")
-    num_static = len(scene.scene.static)
-    selected = scene.scene.select(kept[:num_static], kept[num_static:])
-    return TrainedScene(selected, scene.config, scene.metadata)
+    return scene.select(kept)
 
 
 def _number(scene: TrainedScene) -> int:

@@ -1,13 +1,15 @@
 """The file of edits of a run: a small JSON file next to its checkpoints, which stay as they are."""
 
 import dataclasses
+import re
 import reprlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from warpgs.files import MAX_NUMBER, read_json, read_numbers, write_json
 
-from .options import Box, Editing, Edits
+from .options import Editing, Edits
 
 NAME = "edits.json"
 """File in a run folder."""
@@ -15,6 +17,12 @@ NAME = "edits.json"
 VERSION = 1
 MAX_BYTES = 1 << 16
 """Maximum size of a file [bytes]."""
+
+ROWS = {"box": 6, "recolor": 3, "freeze": 1, "shift": 1}
+"""Edits that are lists of the name of an object and this many numbers."""
+
+BOX_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
+"""Names of objects in boxes; the others have numbers."""
 
 NONE = Path("none")
 """Instead of a file: no edits but those that are given."""
@@ -34,8 +42,9 @@ def edits_in_use(folder: Path, editing: Editing) -> Edits:
     path = editing.edits or folder / NAME
     if path == NONE or (editing.edits is None and not path.exists()):
         return editing.given
-    given = {name: getattr(editing.given, name) for name in _names(editing.given)}
+    given = {name: getattr(editing.given, name) for name in names_of(editing.given)}
     edits = dataclasses.replace(read_edits(path), **given)
+    check(edits)
     return dataclasses.replace(edits, drop_floaters=edits.drop_floaters or None)
 
 
@@ -50,7 +59,7 @@ def save_edits(folder: Path, editing: Editing, edits: Edits) -> Path:
         raise ValueError("--save-edits writes a file: --edits cannot be none")
     path = editing.edits or folder / NAME
     values = {"format": "warpgs edits", "version": VERSION}
-    write_json(path, values | {name: getattr(edits, name) for name in _names(edits)})
+    write_json(path, values | {name: getattr(edits, name) for name in names_of(edits)})
     return path
 
 
@@ -79,32 +88,69 @@ def read_edits(path: Path) -> Edits:
 def check(edits: Edits) -> None:
     """Raises ValueError if a value is out of its range; the message has the option."""
     if edits.crop is not None:
-        if not all(abs(value) <= MAX_NUMBER for value in edits.crop):
-            raise ValueError(f"--crop must be six numbers of at most {MAX_NUMBER:g}, got {_listed(edits.crop)}")
-        if any(edits.crop[axis] == edits.crop[axis + 3] for axis in range(3)):
-            raise ValueError(f"--crop must be opposite corners of a box, got {_listed(edits.crop)}")
+        _check_box("--crop", edits.crop)
+    _check_objects(edits)
     if edits.min_opacity is not None and not 0 <= edits.min_opacity <= 1:
         raise ValueError(f"--min-opacity must be in [0, 1], got {edits.min_opacity}")
     if edits.max_gaussians is not None and edits.max_gaussians < 1:
         raise ValueError(f"--max-gaussians must be at least 1, got {edits.max_gaussians}")
 
 
-def _names(edits: Edits) -> list[str]:
+def _check_box(option: str, box: Sequence[float]) -> None:
+    if not all(abs(value) <= MAX_NUMBER for value in box):
+        raise ValueError(f"{option} must be six numbers of at most {MAX_NUMBER:g}, got {_listed(box)}")
+    if any(box[axis] == box[axis + 3] for axis in range(3)):
+        raise ValueError(f"{option} must be opposite corners of a box, got {_listed(box)}")
+
+
+def _check_objects(edits: Edits) -> None:
+    for name, *box in edits.box:
+        if not BOX_NAME.fullmatch(name):
+            raise ValueError(f"--box must have a name that begins with a letter, got {reprlib.repr(name)}")
+        _check_box(f"--box {name}", box)
+    for option, rows, (low, high) in (
+        ("--recolor", edits.recolor, (0.0, 1.0)),
+        ("--freeze", edits.freeze, (0.0, 1.0)),
+        ("--shift", edits.shift, (-1.0, 1.0)),
+    ):
+        for name, *values in rows:
+            if not all(low <= value <= high for value in values):
+                raise ValueError(f"{option} {name} must be in [{low:g}, {high:g}], got {_listed(values)}")
+    timed = [*(name for name, _ in edits.freeze), *(name for name, _ in edits.shift)]
+    for option, names in (
+        ("--box", [name for name, *_ in edits.box]),
+        ("--recolor", [name for name, *_ in edits.recolor]),
+        ("--freeze or --shift", timed),
+    ):
+        if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
+            raise ValueError(f"{option} was given twice for {twice}")
+
+
+def names_of(edits: Edits) -> list[str]:
     """The names of the edits that change something."""
     return [field.name for field in dataclasses.fields(Edits) if getattr(edits, field.name) != field.default]
 
 
 def _parsed(path: Path, name: str, values: dict[str, Any]) -> Any:
     """The value of an edit in a file."""
+    if name in ROWS:
+        rows, parsed = values[name], []
+        if not isinstance(rows, list) or not all(isinstance(row, list) and row for row in rows):
+            raise ValueError(f"{path}: {name} must be a list of lists, got {reprlib.repr(rows)}")
+        for object_name, *numbers in rows:
+            if not isinstance(object_name, str):
+                raise ValueError(f"{path}: {name} needs the name of an object, got {reprlib.repr(object_name)}")
+            parsed.append((object_name, *read_numbers(path, {name: numbers}, name, (ROWS[name],)).tolist()))
+        return tuple(parsed)
     if name == "crop":
         return tuple(read_numbers(path, values, name, (6,)).tolist())
     if name == "min_opacity":
         return float(read_numbers(path, values, name, ()))
-    kind, value = bool if name == "drop_floaters" else int, values[name]
+    kind, value = {"drop_floaters": bool, "max_gaussians": int}.get(name, str), values[name]
     if type(value) is not kind:
         raise ValueError(f"{path}: {name} cannot be {reprlib.repr(value)}")
     return value
 
 
-def _listed(numbers: Box) -> str:
+def _listed(numbers: Sequence[float]) -> str:
     return " ".join(f"{number:g}" for number in numbers)

@@ -9,11 +9,33 @@ import tyro
 Box = tuple[float, float, float, float, float, float]
 """Two opposite corners of a box along the axes of the scene: x, y, z and x, y, z [scene units]."""
 
+NamedBox = tuple[str, float, float, float, float, float, float]
+"""A name, and a ``Box``."""
+
+NamedColor = tuple[str, float, float, float]
+"""An object, and red, green and blue in [0, 1]."""
+
+NamedTime = tuple[str, float]
+"""An object, and a time."""
+
 
 @dataclass(frozen=True)
 class Edits:
-    """Which Gaussians to remove, in this order; with the defaults none."""
+    """What to change, then which Gaussians to remove, in this order; with the defaults nothing."""
 
+    box: Annotated[tuple[NamedBox, ...], tyro.conf.arg(metavar="NAME X Y Z X Y Z"), tyro.conf.UseAppendAction] = ()
+    """Make an object of the static Gaussians whose centres are inside of a box. Dynamic objects are found without it,
+    and have the names 1, 2, …; 0 is all that belongs to none."""
+    recolor: Annotated[tuple[NamedColor, ...], tyro.conf.arg(metavar="NAME R G B"), tyro.conf.UseAppendAction] = ()
+    """Colour an object in shades of red, green and blue in [0, 1]."""
+    freeze: Annotated[tuple[NamedTime, ...], tyro.conf.arg(metavar="NAME TIME"), tyro.conf.UseAppendAction] = ()
+    """Keep a dynamic object as it is at a time in [0, 1]."""
+    shift: Annotated[tuple[NamedTime, ...], tyro.conf.arg(metavar="NAME TIME"), tyro.conf.UseAppendAction] = ()
+    """Let a dynamic object move later by a time in [-1, 1]; before its start and after its end it stands still."""
+    objects: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME")] = None
+    """Remove all but these objects, such as 2 or 0,1."""
+    remove: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME")] = None
+    """Remove these objects."""
     crop: Annotated[Box | None, tyro.conf.arg(metavar="X Y Z X Y Z")] = None
     """Remove the Gaussians whose centres are outside of a box at all times, given by two opposite corners in the
     coordinates of the scene."""
@@ -23,6 +45,11 @@ class Edits:
     """Remove floaters: isolated Gaussians that the training cameras see little of."""
     max_gaussians: int | None = None
     """Keep at most this many Gaussians: those that the training cameras see most of."""
+
+    @property
+    def about_objects(self) -> bool:
+        """Whether they need to know which object a Gaussian belongs to."""
+        return any((self.box, self.recolor, self.freeze, self.shift, self.objects, self.remove))
 
 
 @dataclass(frozen=True)

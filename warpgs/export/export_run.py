@@ -39,7 +39,8 @@ def export_run(options: Export) -> str:
     _check_out(options)
     _check_values(options)
     run = open_scene(options.run_folder, "cpu", options.data)
-    job, writer = Job(run, options), WRITERS[options.format]
+    writer = WRITERS[options.format]
+    job = Job(run, options, writer.has_objects)
     _check_sequence(job.clouds.scene, options)
     if not writer.has_background and not isinstance(run, SceneFile):
         job.notes.append(_background_note(run))

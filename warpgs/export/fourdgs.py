@@ -2,7 +2,8 @@
 
 Samples at evenly spaced times; between two of them, Gaussians move in straight lines. A sample stores only the
 Gaussians that change: static ones are stored once, and again only where their colour or opacity changes. This model
-holds colours of degree 0, the mean over all directions. Axes are x right, y up, z towards the viewer.
+holds colours of degree 0, the mean over all directions, and the object of each Gaussian (``object_id``). Axes are x
+right, y up, z towards the viewer.
 """
 
 import numpy as np
@@ -12,6 +13,7 @@ from warpgs.formats.cloud import Cloud, sigmoid
 from warpgs.formats.packages import required
 from warpgs.model.gaussians import SH_C0
 
+from .fourdgs_objects import with_object_ids
 from .job import Job, Writer
 from .moving import KEYS, OPTIONS, SECONDS, clouds_over_time
 
@@ -40,7 +42,10 @@ def write_fourdgs(job: Job) -> str:
         gaussians = fourdgs.GaussianSet(**_arrays(cloud, velocity, k * step, seconds))
         samples.append(writer.Sample(k * step, np.arange(len(cloud)), gaussians))
         cloud = following
-    size = write_bytes(path, [file.write_sequence(samples, seconds, profile=PROFILE, library="warpgs")])
+    content = file.write_sequence(samples, seconds, profile=PROFILE, library="warpgs")
+    if cloud.objects is not None and cloud.objects.any():
+        content = with_object_ids(content, cloud.objects)
+    size = write_bytes(path, [content])
     dynamic = int(cloud.is_dynamic.sum())
     count = f"{len(cloud) - dynamic:,} static and {dynamic:,} dynamic Gaussians at {keys} key times"
     return f"{path}: {count}, {size / 1e6:.1f} MB\n{job.up_note}"
@@ -63,4 +68,4 @@ def _arrays(cloud: Cloud, velocity: np.ndarray, time: float, seconds: float) -> 
     }
 
 
-FOURDGS = Writer(write_fourdgs, OPTIONS, ".4dgs", y_up=True)
+FOURDGS = Writer(write_fourdgs, OPTIONS, ".4dgs", has_objects=True, y_up=True)

@@ -27,18 +27,22 @@ class Job:
     Attributes:
         run: The run to export.
         options: Options of the command.
+        has_objects: Whether its files have the objects that Gaussians belong to.
         notes: Lines to print after the summary.
     """
 
     run: Run
     options: Export
+    has_objects: bool = False
     notes: list[str] = field(default_factory=list)
 
     @cached_property
     def clouds(self) -> Clouds:
         """The Gaussians to write: those that edits leave."""
         run, editing, quiet = self.run, self.options.editing, self.options.quiet
-        scene, notes = with_edits(run.trained_scene(), run.folder, editing, lambda: self.capture, quiet)
+        scene, notes = with_edits(
+            run.trained_scene(), run.folder, editing, lambda: self.capture, quiet, self.has_objects
+        )
         self.notes += notes
         return Clouds(scene)
 
@@ -111,6 +115,7 @@ class Writer(NamedTuple):
         options: Names of those options of ``Export`` that apply to this format but not to every other.
         suffix: End of its file names, with the dot; ``--out`` may be such a file. Empty if it has to be a folder.
         has_background: Whether its files have the colour behind the Gaussians; the summary names it otherwise.
+        has_objects: Whether its files have the objects that Gaussians belong to.
         y_up: Whether readers assume that y points up instead of down; None if files keep the scene's coordinates.
     """
 
@@ -118,4 +123,5 @@ class Writer(NamedTuple):
     options: tuple[str, ...]
     suffix: str = ""
     has_background: bool = False
+    has_objects: bool = False
     y_up: bool | None = False

@@ -1,14 +1,16 @@
 """OpenUSD: two prims ParticleField3DGaussianSplat (OpenUSD 26.03 and newer), one per branch, with time samples.
 
 https://openusd.org/release/user_guides/schemas/usdVol/ParticleField3DGaussianSplat.html: positions, orientations,
-linear scales, opacities in [0, 1], and per Gaussian the coefficients of all degrees. What does not change over time is
-stored once; programs interpolate linearly between time samples. Axes are x right, y up, z towards the viewer.
+linear scales, opacities in [0, 1], and per Gaussian the coefficients of all degrees and its object (primvar
+``objectId``). What does not change over time is stored once; programs interpolate linearly between time samples. Axes
+are x right, y up, z towards the viewer.
 """
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64
 
 from warpgs.files import atomic_path
 from warpgs.formats.cloud import Cloud, sigmoid
@@ -81,6 +83,8 @@ class _Field:
         if not self._last:
             self._prim.CreateRadianceSphericalHarmonicsDegreeAttr(degree_of(cloud.sh.shape[1]))
             self._prim.CreateSortingModeHintAttr("zDepth")
+            if cloud.objects is not None:
+                _add_objects(self._prim, cloud.objects)
             self.count = len(cloud)
         for name, values in _values(cloud).items():
             self._set(name, values, time)
@@ -102,6 +106,15 @@ class _Field:
         self._last[name] = values, time
 
 
+def _add_objects(prim: Any, objects: Int64[np.ndarray, " N"]) -> None:
+    """Adds the primvar ``objectId``: the number of each Gaussian's object, 0 for none."""
+    from pxr import Sdf, UsdGeom, Vt  # after ``required``
+
+    types, each = Sdf.ValueTypeNames, UsdGeom.Tokens.vertex
+    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("objectId", types.IntArray, each)
+    primvar.Set(Vt.IntArray.FromNumpy(objects.astype(np.int32)))
+
+
 def _values(cloud: Cloud) -> dict[str, np.ndarray]:
     """The values of the attributes; quaternions as (x, y, z, w)."""
     scales = np.exp(cloud.log_scales)
@@ -121,4 +134,4 @@ def _to_usd(name: str, values: np.ndarray) -> Any:
     return types.get(name, Vt.Vec3fArray).FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
-USD = Writer(write_usd, OPTIONS, ".usdc", y_up=True)
+USD = Writer(write_usd, OPTIONS, ".usdc", has_objects=True, y_up=True)

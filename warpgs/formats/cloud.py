@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Integer
+from jaxtyping import Bool, Float32, Int64, Integer
 from torch import Tensor
 
 from warpgs.model.splats import Splats
@@ -30,6 +30,7 @@ class Cloud:
         logit_opacities: [N] logits of the opacities.
         sh: [N, 1 | 4 | 9 | 16, 3] spherical harmonics coefficients.
         is_dynamic: [N] whether a Gaussian is dynamic; files do not store it.
+        objects: [N] object that a Gaussian belongs to, 0 for none; None if they are not known.
         antialias: Whether opacities compensate for the low-pass filter of the renderer (Mip-Splatting).
     """
 
@@ -39,6 +40,7 @@ class Cloud:
     logit_opacities: Float32[np.ndarray, " N"]
     sh: Float32[np.ndarray, "N bases 3"]
     is_dynamic: Bool[np.ndarray, " N"]
+    objects: Int64[np.ndarray, " N"] | None = None
     antialias: bool = False
 
     @staticmethod
@@ -58,6 +60,7 @@ class Cloud:
             logit_opacities=_to_numpy(torch.logit(opacities)),
             sh=_to_numpy(splats.sh[:, :bases]),
             is_dynamic=np.zeros(len(splats.means), bool) if dynamic is None else dynamic.cpu().numpy(),
+            objects=None if splats.objects is None else splats.objects.cpu().numpy(),
             antialias=antialias,
         )
 
@@ -87,14 +90,16 @@ class Cloud:
 
     def select(self, rows: Integer[np.ndarray, " M"] | Bool[np.ndarray, " N"]) -> "Cloud":
         """The Gaussians of some rows, in the order of the rows."""
-        return self.replaced(**{name: getattr(self, name)[rows] for name in ARRAYS})
+        objects = None if self.objects is None else self.objects[rows]
+        return self.replaced(**{name: getattr(self, name)[rows] for name in ARRAYS}, objects=objects)
 
     def replaced(self, **arrays: Any) -> "Cloud":
         """The cloud with other arrays."""
         return dataclasses.replace(self, **arrays)
 
 
-ARRAYS = tuple(field.name for field in dataclasses.fields(Cloud) if field.name != "antialias")
+ARRAYS = tuple(field.name for field in dataclasses.fields(Cloud) if field.name not in ("objects", "antialias"))
+"""Arrays that every cloud has."""
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:

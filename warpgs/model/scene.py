@@ -95,10 +95,13 @@ class SplitScene(nn.Module):
 
     def select(self, static: Bool[Tensor, " S"], dynamic: Bool[Tensor, " D"]) -> "SplitScene":
         """A scene of copies of the Gaussians to keep, with the same networks."""
-        selected = copy.copy(self)
-        selected._modules = dict(self._modules)
-        selected.static, selected.dynamic = self.static.select(static), self.dynamic.select(dynamic)
-        return selected
+        return self.with_modules(static=self.static.select(static), dynamic=self.dynamic.select(dynamic))
+
+    def with_modules(self, **modules: nn.Module) -> "SplitScene":
+        """The same scene with other Gaussians or networks in place of those of the same name."""
+        changed = copy.copy(self)
+        changed._modules = {**self._modules, **modules}
+        return changed
 
     def splats(
         self,

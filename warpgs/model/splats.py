@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from warpgs.ops.sh import check_coefficients
@@ -26,6 +26,7 @@ class Splats:
         colors: [N, C] features that are blended directly, any number of channels.
         sh: [N, bases, 3] spherical harmonics coefficients with 1, 4, 9 or 16 bases.
         is_dynamic: [N] branch: true for dynamic, false for static Gaussians.
+        objects: [N] number of the object that a Gaussian belongs to, 0 for none; None if they are not known.
         sh_degree: Highest degree of ``sh`` to use; that of ``sh`` by default.
         background: [3] colour behind them, black if None; not used if ``colors`` have another number of channels, which
             are composited over 0.
@@ -42,6 +43,7 @@ class Splats:
     colors: Float[Tensor, "N C"] | None = None
     sh: Float[Tensor, "N bases 3"] | None = None
     is_dynamic: Bool[Tensor, " N"] | None = None
+    objects: Int64[Tensor, " N"] | None = None
     sh_degree: int | None = None
     background: Float[Tensor, "3"] | None = None
     reflections: Reflections | None = None
@@ -62,6 +64,8 @@ class Splats:
             check_coefficients(sizes, self.sh, self.sh_degree)
         if self.is_dynamic is not None:
             check_tensor("is_dynamic", self.is_dynamic, ("N",), sizes, (torch.bool,))
+        if self.objects is not None:
+            check_tensor("objects", self.objects, ("N",), sizes, (torch.int64,))
         if self.background is not None:
             check_tensor("background", self.background, (3,), {})
         tensors = {name: getattr(self, name) for name in self.tensor_names()}
@@ -70,7 +74,7 @@ class Splats:
     @staticmethod
     def tensor_names() -> tuple[str, ...]:
         """Names of the attributes that are tensors of all Gaussians."""
-        return ("means", "quats", "scales", "opacities", "colors", "sh", "is_dynamic")
+        return ("means", "quats", "scales", "opacities", "colors", "sh", "is_dynamic", "objects")
 
     @property
     def num_channels(self) -> int:

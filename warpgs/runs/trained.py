@@ -5,7 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from warpgs.cameras import Camera
@@ -95,6 +95,11 @@ class TrainedScene:
         from warpgs.captures.opening import open_capture  # imports all loaders and the ray tracer
 
         return open_capture(self.config, quiet)
+
+    def select(self, kept: Bool[Tensor, " N"]) -> "TrainedScene":
+        """A scene of copies of the Gaussians to keep, by their rows in ``splats``."""
+        num_static = len(self.scene.static)
+        return TrainedScene(self.scene.select(kept[:num_static], kept[num_static:]), self.config, self.metadata)
 
     @torch.no_grad()
     def splats(self, time: float, residual: bool = True) -> Splats:

@@ -15,6 +15,7 @@ from warpgs.rendering import Layer
 from warpgs.runs.trained import TrainedScene
 from warpgs.visualize.depth import depth_bounds, depth_image
 from warpgs.visualize.images import averaged, to_bytes
+from warpgs.visualize.objects import objects_image
 
 from . import camera_paths
 from .options import Render
@@ -63,6 +64,9 @@ def _images(
 ) -> list[Float[Tensor, "H W C"]]:
     """The images of the chosen layers, averaged down from their supersampled size."""
     larger = camera_paths.resized(camera, float(options.supersample))
+    if options.layers == "objects":
+        image = objects_image(scene.splats(camera.time), larger, scene.config.render_settings)
+        return [averaged(torch.from_numpy(image).to(scene.device).float() / 255.0, options.supersample)]
     if depths is not None:
         return [averaged(_depth_image(scene, larger, depths), options.supersample)]
     rendering = scene.render(larger, branches=options.layers not in ("joint", "alpha"))

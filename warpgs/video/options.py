@@ -41,9 +41,9 @@ class Render:
     """Frames per second of the video; 24 by default."""
     write: Literal["both", "png", "mp4", "gif", "webp"] = "both"
     """Numbered PNG files, a video (MP4, GIF or WebP), or both PNG files and MP4."""
-    layers: Literal["joint", "static", "dynamic", "all", "depth", "alpha"] = "joint"
+    layers: Literal["joint", "static", "dynamic", "all", "depth", "alpha", "objects"] = "joint"
     """What to show: one of the layers, all three side by side, depth in colours (red is near, black is empty), or
-    opacity in grey."""
+    opacity in grey, or objects in colours with the numbers that --objects takes."""
     transparent: bool = False
     """Leave pixels transparent where the layer is; for PNG, GIF and WebP."""
     lens: Literal["pinhole", "recorded"] | None = None

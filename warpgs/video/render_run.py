@@ -54,7 +54,9 @@ def render_run(options: Render) -> str:
         options = dataclasses.replace(options, path="spiral")
     _check(options)
     opened = cache(partial(_opened_capture, run, options.quiet))
-    scene, notes = with_edits(run.trained_scene(), run.folder, options.editing, opened, options.quiet)
+    scene, notes = with_edits(
+        run.trained_scene(), run.folder, options.editing, opened, options.quiet, options.layers == "objects"
+    )
     capture = opened() or camera_paths.default_capture(scene.splats(0.5).means.cpu(), run.folder.name)
     means = scene.splats(_time(options)).means.cpu()
     dynamic = means[len(scene.scene.static) :]

@@ -9,12 +9,12 @@ import numpy as np
 import viser
 from jaxtyping import Float32
 
-from warpgs.editing.edits_file import check
+from warpgs.editing.edits_file import check, names_of
 from warpgs.editing.options import Box, Edits
 from warpgs.errors import one_line
 from warpgs.runs.trained import TrainedScene
 
-from .cleanup_controls import CORNERS, OPACITIES, CleanupControls
+from .cleanup_controls import CORNERS, ONLY, OPACITIES, REMOVE, CleanupControls
 from .panel import clamped, set_value
 from .path_controls import note_html
 from .source import Source
@@ -69,8 +69,12 @@ class Cleanup:
         self._shown: tuple[Edits, TrainedScene] | None = None
         shown = source.current()
         self._can_edit = not source.follow and shown is not None and not shown.varies
+        self._objects = source.object_names
+        if self._objects:
+            controls.object.options = self._objects
         for control in (controls.crop, controls.opacity, controls.floaters, controls.undo, controls.save):
             control.disabled = not self._can_edit
+        controls.object.visible = controls.choice.visible = bool(self._objects)
         self.edits = source.edits
         self._set_controls()
         controls.crop.on_update(lambda _: self._crop())
@@ -80,6 +84,7 @@ class Cleanup:
             lambda _: self._change("min_opacity", clamped(controls.opacity.value, OPACITIES) or None)
         )
         controls.floaters.on_update(lambda _: self._change("drop_floaters", bool(controls.floaters.value) or None))
+        controls.choice.on_click(lambda _: self._choose(controls.object.value, controls.choice.value))
         controls.undo.on_click(lambda _: self._undo())
         controls.save.on_click(lambda _: self._save())
 
@@ -120,6 +125,15 @@ class Cleanup:
             self.edits, self._last = changed, name
             self._set_controls()
         self._wake()
+
+    def _choose(self, name: str, choice: str) -> None:
+        """Shows an object alone, or removes it."""
+        if name not in self._objects:
+            return
+        if choice == ONLY:
+            self._change("objects", name)
+        elif choice == REMOVE:
+            self._change("remove", name if self.edits.remove is None else f"{self.edits.remove},{name}")
 
     def _undo(self) -> None:
         with self._lock:
@@ -174,8 +188,7 @@ class Cleanup:
         set_value(controls.opacity, edits.min_opacity or 0.0)
         set_value(controls.floaters, bool(edits.drop_floaters))
         self._is_setting = False
-        made = [name for name in ("crop", "min_opacity", "drop_floaters", "max_gaussians") if getattr(edits, name)]
-        self._note(", ".join(made) or "no edits")
+        self._note(", ".join(names_of(edits)) or "no edits")
         self._show_box(edits.crop)
 
     def _show_box(self, box: Box | None) -> None:

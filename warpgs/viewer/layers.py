@@ -14,6 +14,7 @@ from warpgs.model.splats import Splats
 from warpgs.rendering import DEFAULTS, Layer, render
 from warpgs.visualize.depth import depth_image
 from warpgs.visualize.images import to_bytes
+from warpgs.visualize.objects import objects_image
 
 Image = UInt8[np.ndarray, "H W 3"]
 
@@ -57,6 +58,7 @@ LAYERS: dict[str, Callable[[Splats, Camera, RenderSettings], Image]] = {
     "depth": depth,
     "alpha": alpha,
     "dynamic weight": dynamic_weight,
+    "objects": objects_image,
 }
 """Layers by name, in the order of the menu. To add one, write its function and add a line here."""
 

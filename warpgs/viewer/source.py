@@ -7,8 +7,9 @@ from pathlib import Path
 import torch
 
 from warpgs.data.capture import Capture
-from warpgs.editing.edited_scene import edited, with_edits
+from warpgs.editing.edited_scene import edited, with_edits, with_ids
 from warpgs.editing.edits_file import edits_in_use, save_edits
+from warpgs.editing.object_scene import ObjectScene, with_boxes
 from warpgs.editing.options import Editing, Edits
 from warpgs.errors import one_line
 from warpgs.runs import preview
@@ -56,10 +57,11 @@ class Source:
         """Begins with the edits of the options; returns lines about them. Raises as ``with_edits``."""
         assert self._scene is not None
         self._editing, self._capture = editing, capture
-        scene, notes = with_edits(self._scene, self.run.folder, editing, lambda: capture)
+        self._scene, notes = with_ids(self._scene, self.run.folder)
+        scene, more = with_edits(self._scene, self.run.folder, editing, lambda: capture)
         self.edits = edits_in_use(self.run.folder, editing)
         self._edited[self.edits] = scene
-        return notes
+        return notes + more
 
     def edited(self, edits: Edits) -> TrainedScene:
         """The scene with other edits, which is kept for all browsers; raises as ``edited_scene.edited``."""
@@ -68,6 +70,14 @@ class Source:
             self._edited = dict([*self._edited.items()][1 - MAX_EDITED :])
             self._edited[edits] = edited(self._scene, edits, self._capture)
         return self._edited[edits]
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Names of the objects of the run, dynamic ones first, then those in boxes of the edits to begin with."""
+        scene = self._scene
+        if not isinstance(scene, ObjectScene):
+            return ()
+        return with_boxes(scene.of_dynamic, scene, self.edits.box).names
 
     def save(self, edits: Edits) -> Path:
         """Writes edits to the file of edits; raises as ``save_edits``, and as ``edited`` if they cannot be made."""
