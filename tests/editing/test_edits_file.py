@@ -3,13 +3,16 @@
 import json
 import shutil
 
+import numpy as np
 import pytest
 import torch
 
+from tests import tiny
 from tests.data.captures import edit_json
 from tests.export.scenes import refusal
 from warpgs.cli import main
 from warpgs.editing.edits_file import MAX_BYTES, NAME, NONE, edits_in_use, read_edits, save_edits
+from warpgs.editing.objects import NAME as OBJECTS
 from warpgs.editing.options import Editing, Edits
 from warpgs.formats.standard import read_standard
 from warpgs.runs import checkpoint
@@ -176,6 +179,20 @@ def test_a_switch_that_is_given_as_off_replaces_the_one_in_the_file(run, capsys)
     assert read_edits(run / NAME) == Edits(max_gaussians=9)
     assert main(["export", str(run), "--quiet", "--drop-floaters", "--save-edits"]) == 0
     assert read_edits(run / NAME) == Edits(drop_floaters=True, max_gaussians=9)
+
+
+def test_files_at_all_times_have_a_frozen_object_as_it_was(run, tmp_path):
+    count = len(Run.open(run, "cpu").trained_scene().scene.dynamic)
+    np.savez(run / OBJECTS, iteration=tiny.LENGTH, ids=np.ones(count, np.int32))
+    means = []
+    for name, *freeze in (("moves",), ("frozen", "--freeze", "1", "0.0")):
+        out = tmp_path / name
+        options = ["--frames", "2", "--layers", "dynamic", "--up", "scene", "--out", str(out), "--quiet"]
+        assert main(["export", str(run), *options, *freeze]) == 0
+        means.append([read_standard(path).means for path in sorted(out.glob("*.ply"))])
+    (start, end), frozen = means
+    assert not np.array_equal(start, end)
+    assert all(np.array_equal(at, start) for at in frozen)
 
 
 def test_floaters_need_the_capture(run, tmp_path, capsys):

@@ -2,15 +2,19 @@
 
 import shutil
 
+import numpy as np
 import pytest
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 pytest.importorskip("playwright.sync_api", reason="browser tests need playwright: pip install -e '.[browser]'")
 
+from tests import tiny
 from tests.viewer.test_browser import SIZE, browser  # noqa: F401  # a fixture
 from tests.viewer.watched import until
 from warpgs.editing.edits_file import NAME, read_edits
+from warpgs.editing.objects import NAME as OBJECTS
 from warpgs.editing.options import Editing, Edits
+from warpgs.runs.run import Run
 from warpgs.viewer.serve import training_cameras
 from warpgs.viewer.server import Viewer
 from warpgs.viewer.source import open_source
@@ -20,6 +24,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connecti
 
 def test_what_is_clicked_is_removed_undone_and_saved(browser, run, tmp_path):  # noqa: F811
     copy = shutil.copytree(run, tmp_path / "run")
+    count = len(Run.open(copy, "cpu").trained_scene().scene.dynamic)
+    np.savez(copy / OBJECTS, iteration=tiny.LENGTH, ids=np.ones(count, np.int32))
     source = open_source(copy, "cpu", False)
     training = training_cameras(source, pytest.fail)
     source.edit(Editing(), training.capture)
@@ -34,6 +40,10 @@ def test_what_is_clicked_is_removed_undone_and_saved(browser, run, tmp_path):  #
         page.get_by_label("crop box").check()
         until(lambda: cleanup.edits.crop is not None)
         until(lambda: len(cleanup.scene().scene.static) < whole)
+        page.get_by_text("Remove", exact=True).click()
+        until(lambda: len(cleanup.scene().scene.dynamic) == 0)
+        page.get_by_text("Undo", exact=True).click()
+        until(lambda: cleanup.edits.remove is None)
         page.get_by_label("drop floaters").check()
         until(lambda: cleanup.edits.drop_floaters)
         page.get_by_text("Undo", exact=True).click()

@@ -19,7 +19,7 @@ from warpgs.editing.objects import NAME as OBJECTS
 from warpgs.editing.options import Editing, Edits
 from warpgs.runs.run import Run
 from warpgs.viewer.cleanup import Cleanup, box_edges
-from warpgs.viewer.cleanup_controls import ONLY, REMOVE
+from warpgs.viewer.cleanup_controls import FREEZE, ONLY, REMOVE
 from warpgs.viewer.source import MAX_EDITED, open_source
 
 pytestmark = pytest.mark.usefixtures("contracts_off", "quickly")
@@ -76,7 +76,8 @@ def visited(source):
     controls = SimpleNamespace(**{name: Control() for name in names})
     controls.corners = [Control((0.0, 0.0, 0.0)) for _ in range(2)]
     woken = []
-    made = Cleanup(Scene(), controls, source, threading.Lock(), lambda: woken.append(1))
+    panel = SimpleNamespace(cleanup=controls, current_time=0.25)
+    made = Cleanup(Scene(), panel, source, threading.Lock(), lambda: woken.append(1))
     made.controls, made.woken, made.browser, made.source = controls, woken, made._scene, source
     return made
 
@@ -237,6 +238,15 @@ def test_an_object_is_shown_alone_or_removed(with_objects):
     choose(with_objects, "1", ONLY)
     assert with_objects.edits == Edits(objects="1")
     assert count(with_objects) == dynamic - dynamic // 2
+
+
+def test_an_object_is_frozen_at_the_current_time(with_objects):
+    choose(with_objects, "1", FREEZE)
+    choose(with_objects, "2", FREEZE)
+    choose(with_objects, "1", FREEZE)
+    assert with_objects.edits == Edits(freeze=(("2", 0.25), ("1", 0.25)))
+    early, late = (with_objects.scene().splats(time).means for time in (0.0, 1.0))
+    assert torch.equal(early, late)
 
 
 def test_the_layer_of_objects_needs_no_edits(with_objects):

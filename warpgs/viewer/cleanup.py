@@ -14,8 +14,8 @@ from warpgs.editing.options import Box, Edits
 from warpgs.errors import one_line
 from warpgs.runs.trained import TrainedScene
 
-from .cleanup_controls import CORNERS, ONLY, OPACITIES, REMOVE, CleanupControls
-from .panel import clamped, set_value
+from .cleanup_controls import CORNERS, FREEZE, ONLY, OPACITIES, REMOVE
+from .panel import Panel, clamped, set_value
 from .path_controls import note_html
 from .source import Source
 
@@ -43,7 +43,7 @@ class Cleanup:
 
     Args:
         scene: Scene of the browser, for the box.
-        controls: Its controls.
+        panel: Its controls.
         source: The scene that is edited, and its edits so far.
         rendering: Lock of ``Renderer``, held while contributions are measured.
         wake: Called after a change.
@@ -55,12 +55,13 @@ class Cleanup:
     def __init__(
         self,
         scene: viser.SceneApi,
-        controls: CleanupControls,
+        panel: Panel,
         source: Source,
         rendering: threading.Lock,
         wake: Callable[[], None],
     ) -> None:
-        self._scene, self._controls, self._source = scene, controls, source
+        controls = panel.cleanup
+        self._scene, self._panel, self._controls, self._source = scene, panel, controls, source
         self._rendering, self._wake, self._lock = rendering, wake, threading.RLock()
         self._before: list[Edits] = []
         self._last = ""  # name of the edit that was changed last
@@ -127,13 +128,16 @@ class Cleanup:
         self._wake()
 
     def _choose(self, name: str, choice: str) -> None:
-        """Shows an object alone, or removes it."""
+        """Shows an object alone, removes it, or freezes it at the current time."""
         if name not in self._objects:
             return
         if choice == ONLY:
             self._change("objects", name)
         elif choice == REMOVE:
             self._change("remove", name if self.edits.remove is None else f"{self.edits.remove},{name}")
+        elif choice == FREEZE:
+            others = tuple(row for row in self.edits.freeze if row[0] != name)
+            self._change("freeze", (*others, (name, self._panel.current_time)))
 
     def _undo(self) -> None:
         with self._lock:

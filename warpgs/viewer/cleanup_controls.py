@@ -10,7 +10,7 @@ CORNERS = ("from", "to")
 OPACITIES = (0.0, 1.0)
 """Range of the slider of opacity."""
 
-ONLY, REMOVE = "Show it alone", "Remove it"
+ONLY, REMOVE, FREEZE = "Show alone", "Remove", "Freeze"
 """What can be done with an object."""
 
 
@@ -28,9 +28,8 @@ class CleanupControls:
             self.opacity = gui.add_slider("min opacity", *OPACITIES, 0.01, 0.0, hint=hint)
             hint = "Removes isolated Gaussians that the training cameras see little of"
             self.floaters = gui.add_checkbox("drop floaters", False, hint=hint)
-            hint = "Of the layer objects; all others, or it alone, can be removed"
-            self.object = gui.add_dropdown("object", ("none",), hint=hint)
-            self.choice = gui.add_button_group("object", (ONLY, REMOVE))
+            self.object = gui.add_dropdown("object", ("none",), hint="A number of the layer objects, or a box")
+            self.choice = gui.add_button_group("action", (ONLY, REMOVE, FREEZE), hint="Freeze: at the current time")
             self.undo = gui.add_button("Undo", hint="The last edit")
             hint = "For all later commands, in the run folder as edits.json; the checkpoint stays as it is"
             self.save = gui.add_button("Save as edits", hint=hint)

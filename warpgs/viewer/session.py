@@ -103,7 +103,7 @@ class Session:
         self.panel = Panel(client.gui, training, width, is_narrow=self._canvas()[0] < NARROW)
         scale, capture = (KEYFRAME_SCALE, None) if training is None else (training.frustum_scale, training.capture)
         self.path = PathEditor(client.scene, self.panel.path, source.run, self, scale, capture)
-        self.cleanup = Cleanup(client.scene, self.panel.cleanup, source, rendering, self._wake.set)
+        self.cleanup = Cleanup(client.scene, self.panel, source, rendering, self._wake.set)
         self._frustums = client.scene.add_frame(FRUSTUMS, show_axes=False, visible=False)
         if view is not None:
             self._restore(view)
