@@ -14,8 +14,6 @@ from warpgs.config.options import scaled
 from warpgs.editing.objects import NAME, find_objects, stored_objects
 from warpgs.runs.trained import TrainedScene
 from warpgs.synthetic import studio
-from warpgs.synthetic.bodies import as_tensors, even_samples
-from warpgs.synthetic.raytrace import raytrace
 
 FIRST, SECOND = slice(0, 200), slice(200, 350)
 
@@ -93,6 +91,22 @@ def test_a_damaged_file_of_objects_is_refused_by_its_name(tmp_path):
         stored_objects(moving.scene(), tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("iteration", "ids"),
+    [
+        (32, np.full(350, -1, np.int32)),
+        (32, np.full(350, 2**31 - 1, np.int32)),
+        (32, np.ones(350)),
+        (32, np.ones((350, 1), np.int32)),
+        ([32, 32], np.ones(350, np.int32)),
+    ],
+)
+def test_a_file_with_other_numbers_is_refused_by_its_name(tmp_path, iteration, ids):
+    np.savez(tmp_path / NAME, iteration=iteration, ids=ids)
+    with pytest.raises(ValueError, match=r"objects\.npz .*: delete it"):
+        stored_objects(moving.scene(), tmp_path)
+
+
 def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "run").write_text("a file")
     ids, note = stored_objects(moving.scene(), tmp_path / "run")
@@ -110,11 +124,8 @@ SIZE = studio.StudioSize(width=96, height=54, num_frames=24, num_samples=1, num_
 
 def bodies_at(means, time, shift):
     """The moving body that a camera of the studio sees where it sees each of some positions; -1 for none."""
-    cpu, static = torch.device("cpu"), studio._static_bodies()
-    camera = studio._camera(time, shift, SIZE)
-    bodies = as_tensors([*static, *studio._moving_bodies(time)], cpu)
-    lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]])
-    traced = raytrace(bodies, lamp, even_samples(1, cpu), camera.viewmat, camera.K, camera.size)
+    static, camera = studio.static_bodies(), studio.camera_at(time, shift, SIZE)
+    traced = studio.trace_bodies([*static, *studio.moving_bodies(time)], camera, 1)
     row, column, _, inside = camera.project(means / studio.SCALE + torch.tensor(studio.CENTER))
     seen = traced.bodies[row.clamp(0, SIZE.height - 1), column.clamp(0, SIZE.width - 1)] - len(static)
     return torch.where(inside, seen, -1).clamp_min(-1)

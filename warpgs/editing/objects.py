@@ -93,7 +93,11 @@ def stored_objects(scene: TrainedScene, folder: Path) -> tuple[Int32[np.ndarray,
     if path.exists():
         stored = read_npz(path, ("iteration", "ids"), MAX_BYTES)
         ids = stored["ids"]
-        if stored["iteration"] == iteration and ids.shape == (count,) and ids.dtype == np.int32:
+        if stored["iteration"].shape != () or ids.ndim != 1 or ids.dtype != np.int32:
+            raise ValueError(f"{path} does not hold one number and whole numbers of 32 bits: delete it")
+        if stored["iteration"] == iteration and len(ids) == count:
+            if not 0 <= ids.min() <= ids.max() <= count:
+                raise ValueError(f"{path} has numbers of objects outside of 0 to {count:,}: delete it")
             return ids, ""
     ids, data = find_objects(scene), io.BytesIO()
     np.savez_compressed(data, iteration=iteration, ids=ids)
