@@ -9,7 +9,7 @@ from tests import plain
 from tests.scenes import error, generator, relative_error
 from warpgs.initialization import motion_fit
 from warpgs.initialization.dynamic_points import DynamicPoints, to_canonical
-from warpgs.initialization.motion_fit import MAX_ERROR, fit_motion
+from warpgs.initialization.motion_fit import MAX_ERROR, Observed, fit_motion
 from warpgs.model.fields import make_deformation
 from warpgs.model.trunk import Trunk
 
@@ -55,7 +55,8 @@ def new_deformation(device="cpu", **model):
 def fit(found, deformation, num_steps=300, is_stopped=bool, graph=True):
     schedule = dataclasses.replace(plain.config().schedule, fit_motion=num_steps)
     config = dataclasses.replace(plain.config(), schedule=schedule, graph=graph)
-    return fit_motion(deformation, found, TIMES, VIEW_SIZE, config, generator(), is_stopped)
+    fitted = fit_motion(deformation, Observed(found, TIMES, VIEW_SIZE), config, generator(), is_stopped)
+    return None if fitted is None else fitted.points
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,9 @@ from warpgs.model.spline_deformation import SplineDeformation
 from warpgs.views.views import Views
 
 from .dynamic_points import MAX_SCALE, DynamicPoints, gaussians_in_box, is_depth_known, unproject_pixels
-from .motion_fit import MAX_POINTS, fit_motion
+from .motion_fit import MAX_POINTS, Observed, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
+from .track_paths import dynamic_paths
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks
 
@@ -90,10 +91,12 @@ class DynamicStart(NamedTuple):
     Attributes:
         gaussians: The Gaussians.
         lacks_fit: Whether the deformation was to be fitted to what moves, but does not follow it.
+        num_tracks: Number of tracks that it follows.
     """
 
     gaussians: Gaussians
     lacks_fit: bool = False
+    num_tracks: int = 0
 
 
 @torch.no_grad()
@@ -123,14 +126,23 @@ def dynamic_gaussians(
     found = unproject_pixels(capture, views, alignments, lambda view: ~view.static_mask, count, generator)
     if found is None:
         return DynamicStart(Gaussians.empty(0, config.model.sh_degree))
-    start: DynamicPoints | None = found
-    if config.schedule.fit_motion and found.depth_known:
-        times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
-        start = fit_motion(deformation, found, times, capture.view_size, config, generator, is_stopped)
-    if start is None:
+    if not (config.schedule.fit_motion and found.depth_known):
+        gaussians = _gaussians_at_dynamic_points(config, capture, found, generator)
+        return DynamicStart(gaussians, lacks_fit=config.schedule.fit_motion > 0)
+    fit = fit_motion(deformation, _observed(capture, views, alignments, found), config, generator, is_stopped)
+    if fit is None:
         return None
-    lacks_fit = config.schedule.fit_motion > 0 and start is found
-    return DynamicStart(_gaussians_at_dynamic_points(config, capture, start, generator), lacks_fit)
+    gaussians = _gaussians_at_dynamic_points(config, capture, fit.points, generator)
+    return DynamicStart(gaussians, fit.points is found, fit.num_tracks)
+
+
+def _observed(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"], found: DynamicPoints) -> Observed:
+    """What a deformation is fitted to: points, and tracks if the capture has some on what moves."""
+    times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
+    paths = None
+    if capture.tracks is not None:
+        paths = dynamic_paths(capture.tracks, list(capture.train), views, alignments)
+    return Observed(found, times, capture.view_size, paths)
 
 
 def _gaussians_at_dynamic_points(

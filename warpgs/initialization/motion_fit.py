@@ -9,6 +9,7 @@ points of all frames first.
 import copy
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -21,6 +22,8 @@ from warpgs.runtime.graphs import GraphCache
 
 from .dynamic_points import PIXELS_PER_CHUNK, DynamicPoints, to_canonical
 from .point_cloud import subsample
+from .track_fit import TrackFit
+from .track_paths import Paths
 
 MAX_POINTS, MAX_POINTS_PER_VIEW = 40_000, 2_000
 """Maximum number of dynamic points of all frames together, and of those in one frame that the fit compares."""
@@ -46,6 +49,12 @@ points, so that each is close to its solution when it is first compared."""
 LEARNING_RATE = 1e-3
 """Rate of Adam."""
 
+TRACK_STEPS, TRACK_WEIGHT = 3, 10.0
+"""Steps that fit the deformation to tracks alone, before others, per step of the fit; weight of tracks in these."""
+
+ANCHOR_RATE = 1e-2
+"""Rate of Adam for the canonical points of tracks [units]."""
+
 MAX_STRETCH = 1.5
 """Maximum distance of a point from the nearest canonical one, relative to that at the time when it was seen: they are
 the same where an object turns as a whole."""
@@ -57,49 +66,87 @@ MIN_KEPT = 0.3
 """Fraction of the points that a fitted deformation has to move to where they were seen, or it is not used."""
 
 
+class Observed(NamedTuple):
+    """What the T training views see of what moves.
+
+    Attributes:
+        points: At least one point, all at known depth.
+        times: [T] times of the views in [0, 1].
+        view_size: Of the capture [scene units].
+        paths: Tracks of a network; None without any.
+    """
+
+    points: DynamicPoints
+    times: Float[Tensor, " T"]
+    view_size: float
+    paths: Paths | None = None
+
+
+class MotionFit(NamedTuple):
+    """Dynamic points after a fit.
+
+    Attributes:
+        points: Those that are deformed to where they were seen, at their canonical positions; all as found if those
+            are fewer than ``MIN_KEPT``.
+        num_tracks: Number of tracks that the deformation follows; 0 if it was fitted without them.
+    """
+
+    points: DynamicPoints
+    num_tracks: int
+
+
 def fit_motion(
     deformation: nn.Module,
-    found: DynamicPoints,
-    times: Float[Tensor, " T"],
-    view_size: float,
+    observed: Observed,
     config: TrainConfig,
     generator: torch.Generator,
     is_stopped: Callable[[], bool] = bool,
-) -> DynamicPoints | None:
+) -> MotionFit | None:
     """Fits a deformation to dynamic points, and moves these to canonical space.
 
     The points around one time are canonical. Deformed to the time of each other frame, they come close to its points.
+    Tracks are followed before that, unless the deformation cannot follow as many as ``MIN_KEPT`` of them.
 
     Args:
         deformation: As ``fields.FIELDS`` says; its parameters, of which there must be some, are changed.
-        found: At least one point, all at known depth.
-        times: [T] times of the views in [0, 1].
-        view_size: Of the capture [scene units].
+        observed: What the views see.
         config: ``schedule.fit_motion`` is the number of steps of Adam, each on the points of one frame; ``graph``
             says whether they are replayed on CUDA.
         generator: CPU generator that chooses the frames.
         is_stopped: Asked after each step whether to stop.
 
     Returns:
-        Those of the points that are deformed to where they were seen, at their canonical positions; all points as found
-        if those are fewer than ``MIN_KEPT``, or None if stopped, and the deformation as it was.
+        The points; None if stopped, and the deformation as it was, as it is where no points are moved.
     """
     # In half precision, the network of one of six seeds learned nothing on builtin:studio without depth.
     fitted = in_single_precision(copy.deepcopy(deformation).requires_grad_(True))
-    device = next(fitted.parameters()).device
-    points = _PointsByView(found, times, view_size, device, generator)
-    if not _fit(fitted, points, config, generator, is_stopped):
+    device, found = next(fitted.parameters()).device, observed.points
+    points = _PointsByView(found, observed.times, observed.view_size, device, generator)
+    tracks = _tracks(observed, points, generator)
+    if not _fit(fitted, points, tracks, config, generator, is_stopped):
         return None
+    num_tracks = 0 if tracks is None else points.take_home(tracks, fitted)
+    if tracks is not None and num_tracks == 0:
+        return fit_motion(deformation, observed._replace(paths=None), config, generator, is_stopped)
     kept = points.canonical(fitted, found, config.graph and device.type == "cuda")
     if len(kept.views) < MIN_KEPT * len(found.views):
-        return found
+        return MotionFit(found, 0)
     deformation.load_state_dict(fitted.state_dict())
-    return kept
+    return MotionFit(kept, num_tracks)
+
+
+def _tracks(observed: Observed, points: "_PointsByView", generator: torch.Generator) -> TrackFit | None:
+    """The tracks of known depth; None without any."""
+    if observed.paths is None:
+        return None
+    tracks = TrackFit(observed.paths, points.views, points.unit, points.home.device, generator)
+    return tracks if len(tracks.anchors) else None
 
 
 def _fit(
     deformation: nn.Module,
     points: "_PointsByView",
+    tracks: TrackFit | None,
     config: TrainConfig,
     generator: torch.Generator,
     is_stopped: Callable[[], bool],
@@ -110,31 +157,51 @@ def _fit(
         torch.tensor(LEARNING_RATE, dtype=torch.float32, device=device),
         torch.zeros(1, dtype=torch.int64, device=device),
     )
-    optimizer = Adam([{"params": list(deformation.parameters()), "lr": rate}])
-    take_step = partial(_take_step, deformation, points, index, optimizer)
+    groups = [{"params": list(deformation.parameters()), "lr": rate}]
+    if tracks is not None:
+        groups.append({"params": [tracks.anchors], "lr": torch.full_like(rate, ANCHOR_RATE)})
+    optimizer = Adam(groups)
     is_replayed = config.graph and device.type == "cuda"
-    graphs: GraphCache[str] | None = GraphCache(max_graphs=1, repeatable=False) if is_replayed else None
-    for step in range(num_steps):
-        index.fill_(points.choose_view(step / (GROWTH * num_steps), generator))
-        if graphs is None:
-            take_step()
-        else:
-            graphs.run("step", take_step)
-        if is_stopped():
-            return False
+    graphs: GraphCache[int] | None = GraphCache(max_graphs=1, repeatable=False) if is_replayed else None
+    losses = [(num_steps, partial(_loss, deformation, points, tracks, index))]
+    if tracks is not None:
+        losses.insert(0, (TRACK_STEPS * num_steps, partial(_loss_of_tracks, deformation, points, tracks, index)))
+    for stage, (count, loss) in enumerate(losses):
+        for step in range(count):
+            progress = step / (GROWTH * count) if stage == 0 else 1.0
+            index.fill_(points.choose_view(progress, generator))
+            take_step = partial(_take_step, loss, optimizer)
+            if graphs is None:
+                take_step()
+            else:
+                graphs.run(stage, take_step)
+            if is_stopped():
+                return False
     return True
 
 
 @torch.enable_grad()
-def _take_step(
-    deformation: nn.Module, points: "_PointsByView", index: Int64[Tensor, "1"], optimizer: Adam
-) -> tuple[Tensor, ...]:
-    """Fits the deformation a little better to the points of the view whose index is on the device."""
-    time, seen, count = points.pick(index)
-    _distance(points.deformed(deformation, time), seen, count).backward()
+def _take_step(loss: Callable[[], Float[Tensor, ""]], optimizer: Adam) -> tuple[Tensor, ...]:
+    """Fits the deformation a little better to the view whose index is on the device."""
+    loss().backward()
     optimizer.step()
     optimizer.zero_grad()
     return ()
+
+
+def _loss(
+    deformation: nn.Module, points: "_PointsByView", tracks: TrackFit | None, index: Int64[Tensor, "1"]
+) -> Float[Tensor, ""]:
+    """Distance of the deformed canonical points from those of a view, and of tracks from where it sees them."""
+    time, seen, count = points.pick(index)
+    distance = _distance(points.deformed(deformation, time), seen, count)
+    return distance if tracks is None else distance + TRACK_WEIGHT * tracks.loss(deformation, time, index)
+
+
+def _loss_of_tracks(
+    deformation: nn.Module, points: "_PointsByView", tracks: TrackFit, index: Int64[Tensor, "1"]
+) -> Float[Tensor, ""]:
+    return tracks.loss(deformation, points.times.index_select(0, index)[0], index)
 
 
 class _PointsByView:
@@ -149,7 +216,7 @@ class _PointsByView:
         seen: [V, P, 6] features of at most ``MAX_POINTS_PER_VIEW`` points of each view, repeated until there are as
             many as in the view with the most.
         counts: [V] number of points without repetitions.
-        home: [H, 6] features of the canonical points, at most ``MAX_POINTS_PER_VIEW``.
+        home: [H, 6] features of the canonical points, at most ``MAX_POINTS_PER_VIEW``, or those of tracks.
     """
 
     def __init__(
@@ -196,6 +263,18 @@ class _PointsByView:
         positions, colors = self.home.split(3, 1)
         offsets = deformation(positions * self.unit, time)[:, :3]
         return torch.cat([positions + offsets / self.unit, colors], 1)
+
+    def take_home(self, tracks: TrackFit, deformation: nn.Module) -> int:
+        """Replaces the canonical points by those of the tracks that a deformation follows, and returns their number.
+
+        It is 0, and nothing is replaced, if it follows less than ``MIN_KEPT`` of them.
+        """
+        follows = tracks.followed(deformation, self.times, self.max_error)
+        count = int(follows.sum())
+        if count < MIN_KEPT * len(follows):
+            return 0
+        self.home = torch.cat([tracks.anchors.detach(), tracks.colors / COLOR_UNIT], 1)[follows]
+        return count
 
     @torch.no_grad()
     def canonical(self, deformation: nn.Module, found: DynamicPoints, is_replayed: bool = False) -> DynamicPoints:

@@ -180,6 +180,8 @@ class Trainer:
             return False
         if logger is not None and found.lacks_fit:
             logger.log("warning: no deformation follows what moves: dynamic Gaussians start where frames show them")
+        if logger is not None and (tracks := self.capture.tracks) is not None:
+            logger.log(f"the deformation follows {found.num_tracks:,} of {len(tracks.positions):,} tracks")
         self.scene.set_dynamic(found.gaussians)
         self._start_from(self.scene)
         return True
