@@ -22,6 +22,10 @@ from warpgs.data.exr import read_exr_channel
 from warpgs.data.images import decode
 from warpgs.data.npz import read_npz
 from warpgs.data.ply import read_ply_points
+from warpgs.data.results.depth import read_depths
+from warpgs.data.results.masks import read_masks
+from warpgs.data.results.tracks import read_tracked_points
+from warpgs.data.tracks import make_tracks, read_tracks, write_tracks
 from warpgs.files import read_array
 from warpgs.prepare.cameras.intrinsics import read_intrinsics
 from warpgs.report.evaluated_run import read_runs
@@ -118,6 +122,7 @@ def write_small_files(root):
     layouts.write_ply(root / "points_ascii.ply", "ascii")
     write_array(root / "array.npy", np.arange(60, dtype=np.float32).reshape(3, 20))
     np.savez_compressed(root / "arrays.npz", a=np.arange(60.0), b=np.eye(3, dtype=np.float16))
+    write_results(root)
     with zipfile.ZipFile(root / "depth.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for compression in (0, 2, 3):
             archive.writestr(f"{compression}.exr", layouts.exr(np.ones((20, 37)), compression))
@@ -126,6 +131,28 @@ def write_small_files(root):
     write_config(root, plain.plan(TrainConfig()))
     write_json(root / "metrics.json", METRICS)
     (root / "views.csv").write_text(VIEWS)
+
+
+FRAMES, IMAGE = ["a", "b", "c"], (40, 24)
+
+
+def write_results(root):
+    """A file of each layout in which networks leave tracks, masks and depth of three frames."""
+    positions, visible = np.random.default_rng(0).uniform(1.0, 20.0, (5, 3, 2)), np.ones((5, 3), bool)
+    write_tracks(root, positions, visible, IMAGE)
+    np.savez(root / "cotracker.npz", pred_tracks=positions.transpose(1, 0, 2)[None], pred_visibility=visible.T[None])
+    np.savez(root / "tapir.npz", tracks=positions, occluded=~visible)
+    cameras = {"extrinsics": np.tile(np.eye(4), (3, 1, 1)), "intrinsics": np.tile(MATRIX, (3, 1, 1))}
+    depth = np.full((3, 24, 40), 2.0, np.float32)
+    np.savez(
+        root / "spatial.npz", coords=np.tile([0.5, 0.5, 5.0], (3, 5, 1)), visibs=visible.T, depths=depth, **cameras
+    )
+    np.savez(root / "depth.npz", depth=depth[..., None])
+    np.savez(root / "masks.npz", masks=depth[:, None] > 1.0)
+
+
+def read_result_of_tracks(path):
+    make_tracks(path, FRAMES, *read_tracked_points(path, IMAGE), IMAGE)
 
 
 def read_depth(path):
@@ -152,6 +179,10 @@ def small_readers(tmp_path):
         "array.npy": lambda p: read_array(p, 1 << 16),
         "arrays.npz": lambda p: read_npz(p, ("a", "b"), 1 << 20),
         "depth.zip": read_depth,
+        "tracks.npz": lambda p: read_tracks(p.parent, FRAMES),
+        **dict.fromkeys(("cotracker.npz", "tapir.npz", "spatial.npz"), read_result_of_tracks),
+        "depth.npz": lambda p: [*read_depths(p, FRAMES, [IMAGE] * 3)],
+        "masks.npz": lambda p: [*read_masks(p, FRAMES, [IMAGE] * 3)],
         **dict.fromkeys(("image.png", "image.jpg"), decode),
         **dict.fromkeys(("config.json", "metrics.json", "views.csv"), lambda p: read_runs([p.parent])),
     }

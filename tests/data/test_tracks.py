@@ -149,7 +149,7 @@ def test_positions_of_frames_of_another_size_are_refused(tmp_path, seen):
         read_tracks(tmp_path, NAMES)
 
 
-@pytest.mark.parametrize("size", [np.array([40]), np.array([40, 0])])
+@pytest.mark.parametrize("size", [np.array([40]), np.array([40, 0]), np.array([40, np.inf])])
 def test_a_size_that_is_none_is_refused(tmp_path, seen, size):
     positions, visible = seen
     np.savez(tmp_path / "tracks.npz", tracks=positions, visibles=visible, size=size)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from warpgs.files import write_bytes
 
+from .images import MAX_SIDE
 from .npz import read_npz
 
 FILE = "tracks.npz"
@@ -20,6 +21,9 @@ MAX_BYTES = 2 << 30
 
 VISIBLE = 0.5
 """Probability above which a point is visible."""
+
+MAX_POSITION = 1e6
+"""Positions beyond this are written as if they were there; they are outside of any image [px]."""
 
 MAX_OUTSIDE = 0.5
 """Fraction of the visible positions that may be outside of the image; more are of frames of another size."""
@@ -58,7 +62,7 @@ def read_tracks(root: Path, frames: Sequence[str] | None) -> Tracks | None:
         return None
     arrays = read_npz(path, ("tracks", "visibles", "size"), MAX_BYTES)
     size = arrays["size"]
-    if size.shape != (2,) or not (size >= 1).all():
+    if size.shape != (2,) or not ((size >= 1) & (size <= MAX_SIDE)).all():
         raise ValueError(f"{path}: size must be the width and height of the frames that tracks count pixels of")
     return make_tracks(path, frames, arrays["tracks"], arrays["visibles"], (int(size[0]), int(size[1])))
 
@@ -92,7 +96,7 @@ def make_tracks(
     seen = visible > VISIBLE
     if not np.isfinite(positions[seen]).all():
         raise ValueError(f"{path}: positions of visible points must be finite numbers")
-    relative = positions / np.array(size, np.float32)
+    relative = np.where(seen[..., None], positions, 0.0) / np.array(size, np.float64)
     inside = seen & ((relative >= 0.0) & (relative < 1.0)).all(2)
     if inside.sum() < (1.0 - MAX_OUTSIDE) * seen.sum():
         raise ValueError(
@@ -117,6 +121,6 @@ def write_tracks(
         OSError: If the file cannot be written; the message names it.
     """
     file = io.BytesIO()
-    known = np.where(visible[..., None], positions, 0.0).astype(np.float32)
+    known = np.where(visible[..., None], positions, 0.0).clip(-MAX_POSITION, MAX_POSITION).astype(np.float32)
     np.savez_compressed(file, tracks=known, visibles=visible, size=np.array(size, np.int64))
     write_bytes(root / FILE, [file.getvalue()])

@@ -42,6 +42,11 @@ def read_tracked_points(path: Path, size: tuple[int, int]) -> TrackedPoints:
     Raises:
         ValueError: If the file is damaged or of another layout, or its arrays do not fit each other.
     """
+    with np.errstate(all="ignore"):  # positions of hidden points may be any numbers, those of visible ones are checked
+        return _read(path, size)
+
+
+def _read(path: Path, size: tuple[int, int]) -> TrackedPoints:
     names = names_of(path)
     if {"pred_tracks", "pred_visibility"} <= names:
         return _cotracker(path)
@@ -89,8 +94,7 @@ def _spatial_tracker(path: Path, size: tuple[int, int]) -> TrackedPoints:
         )
     viewed = np.einsum("tij,tnj->nti", extrinsics[:, :3, :3], coords) + extrinsics[:, :3, 3]
     projected = np.einsum("tij,ntj->nti", K, viewed)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        positions = projected[..., :2] / projected[..., 2:]
+    positions = projected[..., :2] / projected[..., 2:]
     height, width = depths.shape[1:]
     scale = np.array([size[0] / width, size[1] / height])
     return TrackedPoints((positions * scale).astype(np.float32), (visible.T > VISIBLE) & (viewed[..., 2] > 0.0))
