@@ -12,7 +12,7 @@ SUFFIXES = (".png", ".png.png")
 
 
 def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> list[Path]:
-    """The mask of every frame. All must be named the same way.
+    """The mask of every frame. All must be named the same way: of a video, whose frames are no files, like the frames.
 
     Raises:
         ValueError: If one is missing.
@@ -21,9 +21,11 @@ def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> list[Path]:
     def find(*stems: str) -> Path | None:
         return next((path for stem in stems if (path := find_file(folder, stem, SUFFIXES))), None)
 
-    as_source = [find(Path(frame.source).stem, frame.source) for frame in frames]
     as_frames = [find(frame.name) for frame in frames]
-    found = min(as_source, as_frames, key=lambda paths: paths.count(None))
+    found, are_files = as_frames, all(Path(frame.source).suffix for frame in frames)
+    if are_files:
+        as_source = [find(Path(frame.source).stem, frame.source) for frame in frames]
+        found = min(as_source, as_frames, key=lambda paths: paths.count(None))
     if None in found:
         frame = frames[found.index(None)]
         name = frame.name if found is as_frames else Path(frame.source).stem
