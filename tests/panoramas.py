@@ -55,20 +55,30 @@ def _moving_board(time: float) -> Board:
     return 2, 1.8, center, (0.45, 0.4), texture(9, RED, 128, (4, 12))
 
 
+def _span(is_seen: np.ndarray) -> slice:
+    """From the first to the last that is true."""
+    seen = is_seen.nonzero()[0]
+    return slice(seen[0], seen[-1] + 1)
+
+
 def frame(time: float, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[H, W, 3] RGB image, [H, W] mask of the moving board, and [H, W] distance from the camera."""
     rotation, position = pose(time)
     fine = Lens.panorama((SAMPLES * width, SAMPLES * width // 2))
-    directions = fine.rays(*fine.pixel_centers()) @ rotation
-    nearest, image = np.full(directions.shape[:2], np.inf), np.zeros(directions.shape, np.uint8)
+    directions = (fine.rays(*fine.pixel_centers()) @ rotation).astype(np.float32)
+    position = position.astype(np.float32)
+    nearest, image = np.full(directions.shape[:2], np.inf, np.float32), np.zeros(directions.shape, np.uint8)
     for axis, plane, center, half, paint in (*_still_boards(), _moving_board(time)):
         others = [k for k in range(3) if k != axis]
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = (plane - position[axis]) / directions[..., axis]
             on_board = (position[others] + distance[..., None] * directions[..., others] - center) / half
         moves = (distance > 0) & (np.abs(on_board) <= 1).all(-1) & (distance < nearest)
-        maps = ((on_board + 1.0) / 2.0 * (len(paint) - 1)).astype(np.float32)
-        image[moves] = cv2.remap(paint, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[moves]
+        if (columns := moves.any(0)).any():
+            rows, columns = _span(moves.any(1)), _span(columns)
+            maps = ((on_board[rows, columns] + 1.0) / 2.0 * (len(paint) - 1)).astype(np.float32)
+            painted = cv2.remap(paint, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            image[rows, columns][moves[rows, columns]] = painted[moves[rows, columns]]
         nearest = np.where(moves, distance, nearest)
     middle = slice(SAMPLES // 2, None, SAMPLES)
     small = cv2.resize(image, (width, width // 2), interpolation=cv2.INTER_AREA)

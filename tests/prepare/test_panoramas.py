@@ -13,7 +13,7 @@ from warpgs.prepare.add import AddOptions, add_parts
 from warpgs.prepare.cameras.panorama import TURNS, cut, joined, view_lens
 from warpgs.prepare.options import Options
 
-COUNT, WIDTH = 16, 480
+COUNT, WIDTH = 14, 480
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,9 @@ def made(frames, tmp_path_factory):
     root = tmp_path_factory.mktemp("panoramas")
     source = boards.write_folder(root / "shots", [image for image, _, _ in frames])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("warpgs.prepare.depth.estimate.MAX_SIDE", 400)  # to be faster
+        patch.setattr("warpgs.prepare.masks.masker.WORKING_SIDE", 384)  # views are hardly larger than the panoramas
+        patch.setattr("warpgs.prepare.cameras.features.MAX_FEATURES", 1000)
+        patch.setattr("warpgs.prepare.depth.estimate.MAX_SIDE", 300)
         pipeline.prepare([source], root / "made", Options(lens="EQUIRECTANGULAR"))
     return load_capture(root / "made")
 
