@@ -46,8 +46,9 @@ def pairs_to_compare(capture: Capture, max_count: int) -> list[tuple[str, str]]:
     """
     cameras = capture.cameras
     pairs = [(a, b) for a, b in capture.neighbours(capture.train) if are_comparable(cameras[a], cameras[b])]
-    still = [(a, b) for a, b in pairs if _stands_still(cameras[a], cameras[b])]
-    moving = [pair for pair in pairs if pair not in {*still}]
+    still, moving = list[tuple[str, str]](), list[tuple[str, str]]()
+    for a, b in pairs:
+        (still if _stands_still(cameras[a], cameras[b]) else moving).append((a, b))
     chosen = evenly_spaced(moving, max(max_count - len(still), -(-max_count // 2)))
     return [*chosen, *evenly_spaced(still, max_count - len(chosen))]
 
