@@ -29,7 +29,7 @@ def folder(cache):
 
 
 def test_the_content_is_the_same_everywhere(folder):
-    assert content(folder) == "81688a40dad7d3864a9a06c092f8bf1f"
+    assert content(folder) == "753c14b7070dca5392f7426d167e7c88"
 
 
 def test_six_cameras_stand_still_and_one_of_them_evaluates(folder):
@@ -47,6 +47,20 @@ def test_the_nearest_training_cameras_are_on_both_sides_of_the_held_out_one(fold
     held_out, *others = (capture.cameras[f"cam{i}_000000"] for i in range(6))
     sides = [held_out.viewmat[0, :3] @ (other.position - held_out.position) for other in others[:2]]
     assert sides[0] > 0 > sides[1]
+
+
+def test_training_cameras_see_what_the_held_out_one_sees():
+    cameras = [rig.lens_of(SMALL).camera(*rig.pose_of(camera), 0.5) for camera in range(6)]
+    depths = [rig.trace_from(camera, SMALL)[1] for camera in cameras]
+    held_out = cameras[0]
+    rays = (held_out.pixel_centers - held_out.K[:2, 2]) / held_out.K.diagonal()[:2]
+    points = torch.cat([rays, torch.ones(len(rays), 1)], 1) * depths[0].reshape(-1, 1)
+    points = (points - held_out.viewmat[:3, 3]) @ held_out.viewmat[:3, :3]
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for camera, depth in zip(cameras[1:], depths[1:], strict=True):
+        row, column, distance, inside = camera.project(points)
+        seen |= inside & ((depth[row, column] - distance).abs() < 0.03 * distance)
+    assert seen.float().mean() > 0.97
 
 
 def test_the_images_of_a_camera_are_as_its_pose_and_time_say(folder):

@@ -24,7 +24,7 @@ from warpgs.visualize.images import to_bytes
 from .cache import cached, content_folder
 from .studio import CENTER, SCALE, StudioSize, lens_of, looking_at_table, sixteen_bits, surface_points, trace_from
 
-ANGLES = (-102.0, -78.0, -126.0, -54.0, -150.0, -30.0)
+ANGLES = (-90.0, -78.0, -126.0, -54.0, -150.0, -30.0)
 """Where the cameras stand around the table, that for evaluation first; with fewer, those next to it [degrees]."""
 
 DELAYS = (0.37, 0.0, 1.0, 0.62, 0.21, 0.83)
@@ -33,7 +33,7 @@ DELAYS = (0.37, 0.0, 1.0, 0.62, 0.21, 0.83)
 RATE = 10.0
 """Frames of a camera per second."""
 
-VERSION = 1
+VERSION = 2
 """Increase it when the content changes, so that cached captures are not used any more."""
 
 
@@ -55,7 +55,9 @@ class RigSize(StudioSize):
 def pose_of(camera: int) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
     """World-to-camera rotation and position of a camera in the world."""
     angle = math.radians(ANGLES[camera])
-    position = np.array([3.1 * math.cos(angle), 3.1 * math.sin(angle), 1.78 + 0.25 * math.sin(3.0 * angle)])
+    # The held-out camera stands closer and lower, so that its image shows nothing that no other camera sees.
+    distance, height = (2.3, 1.5) if camera == 0 else (3.1, 1.78 + 0.25 * math.sin(3.0 * angle))
+    position = np.array([distance * math.cos(angle), distance * math.sin(angle), height])
     return looking_at_table(position), position
 
 
