@@ -138,6 +138,8 @@ def test_lines_about_objects_name_those_in_boxes(scene, tmp_path):
     [
         (Edits(objects="3"), "--objects 3: there is no such object; the objects of this scene are: 1, 2"),
         (Edits(remove="1,tree"), "--remove tree: there is no such object"),
+        (Edits(objects=""), "--objects : there is no such object"),
+        (Edits(remove=""), "--remove : there is no such object"),
         (Edits(freeze=(("5", 0.5),)), "--freeze 5: there is no such object"),
         (Edits(freeze=(("0", 0.5),)), "--freeze 0: this object has no dynamic Gaussians"),
         (Edits(freeze=(("1", 1.5),)), r"--freeze 1 must be in \[0, 1\], got 1.5"),

@@ -49,7 +49,8 @@ class Edits:
     @property
     def about_objects(self) -> bool:
         """Whether they need to know which object a Gaussian belongs to."""
-        return any((self.box, self.recolor, self.freeze, self.shift, self.objects, self.remove))
+        named = self.objects is not None or self.remove is not None
+        return named or any((self.box, self.recolor, self.freeze, self.shift))
 
 
 @dataclass(frozen=True)
