@@ -137,6 +137,15 @@ def test_a_palette_of_black_and_white_is_0_where_dynamic(tmp_path, dynamic):
     np.testing.assert_array_equal(read_object_mask(tmp_path / "a.png", SIZE), dynamic[1])
 
 
+def test_ids_without_their_palette_are_refused_by_the_name_of_the_file(tmp_path, dynamic):
+    path = tmp_path / "a.png"
+    write_with_palette(path, np.where(dynamic[1], 2, 0), DAVIS)
+    before, after = path.read_bytes().split(b"PLTE")
+    path.write_bytes(before[:-4] + after[3 * len(DAVIS) + 4 :])  # without the chunk's length, colours and checksum
+    with pytest.raises(ValueError, match=r"a\.png is damaged: it has no palette"):
+        read_object_mask(path, SIZE)
+
+
 def test_a_pixel_of_reduced_ids_is_dynamic_if_any_part_of_it_is(tmp_path):
     ids = np.zeros((84, 112), int)
     ids[10, 31] = 1

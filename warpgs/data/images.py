@@ -106,6 +106,8 @@ def palette_of(path: Path) -> UInt8[np.ndarray, "K 3"] | None:
     if not data.startswith(_PNG) or data[_PNG_COLOR_TYPE : _PNG_COLOR_TYPE + 1] != b"\x03":
         return None
     start = data.find(b"PLTE")
+    if start < 0:
+        raise ValueError(f"{path} is damaged: it has no palette for its indices of colours")
     length = int.from_bytes(data[start - 4 : start], "big")
     return np.frombuffer(data, np.uint8, length - length % 3, start + 4).reshape(-1, 3)
 
