@@ -384,7 +384,7 @@ def test_tracks_of_a_network_are_copied(root, tmp_path, capsys):
     [
         (["--add", "tracks"], "--add tracks and --tracks FILE belong together"),
         (["--add", "masks", "--tracks", "a.npz"], "--add tracks and --tracks FILE belong together"),
-        (["--add", "masks", "--masks", "no/such/masks"], "if it is not an existing file or folder, must be one of"),
+        (["--add", "masks", "--masks", "no/such/masks"], "if not from an existing file or folder"),
     ],
 )
 def test_results_that_are_not_given_are_refused(root, options, message, capsys):

@@ -88,7 +88,7 @@ def _check_options(options: AddOptions) -> None:
     for name, value, methods in (("masks", options.masks, MASKERS), ("depth", options.depth, DEPTHS)):
         known = [method for method, implementation in methods.items() if implementation is not None]
         if value not in known and not Path(value).exists():
-            option = f"to add {name}, --{name}, if it is not an existing file or folder,"
+            option = f"to add {name}, if not from an existing file or folder, --{name}"
             raise ValueError(not_one_of(option, value, known))
     if ("tracks" in options.parts) != (options.tracks is not None):
         raise ValueError("--add tracks and --tracks FILE belong together")
