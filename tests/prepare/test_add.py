@@ -365,6 +365,14 @@ def test_depth_of_a_network_is_copied_as_inverse_depth(root, tmp_path):
         np.testing.assert_allclose(found * plane, np.full_like(plane, np.median(found * plane)), rtol=2e-3)
 
 
+@pytest.mark.parametrize(("part", "files"), [("masks", "their files"), ("depth", "its files")])
+def test_results_that_are_not_read_are_named(root, part, files, tmp_path, capsys):
+    assert main(["prepare", str(root), "--add", part]) == 0
+    capsys.readouterr()
+    assert main(["prepare", str(root), "--add", part, f"--{part}", str(tmp_path)]) == 0
+    assert f"{tmp_path} was not read: delete {files} first" in capsys.readouterr().out
+
+
 def test_tracks_of_a_network_are_copied(root, tmp_path, capsys):
     positions = np.random.default_rng(0).uniform(10.0, 180.0, (COUNT, 20, 2))
     np.savez(tmp_path / "result.npz", pred_tracks=positions, pred_visibility=np.ones((COUNT, 20), bool))
@@ -376,7 +384,7 @@ def test_tracks_of_a_network_are_copied(root, tmp_path, capsys):
     expected = (positions.transpose(1, 0, 2) + 0.5) / (256, 192)
     np.testing.assert_allclose(tracks.positions, expected, atol=1e-6)
     assert main(command) == 0
-    assert "tracks: they are there" in capsys.readouterr().out
+    assert "result.npz was not read: delete tracks.npz first to replace what is there" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from warpgs.data.results.depth import read_depths
 from warpgs.data.results.masks import read_masks
 from warpgs.data.results.tracks import read_tracked_points
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.data.tracks import make_tracks, read_tracks, write_tracks
+from warpgs.data.tracks import FILE, make_tracks, read_tracks, write_tracks
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.errors import not_one_of
 from warpgs.files import read_json, write_json
@@ -44,7 +44,7 @@ from .depth.methods import DEPTHS
 from .frames.images import resize_to_side
 from .masks.masker import WORKING_SIDE, DynamicMasks
 from .masks.methods import MASKERS
-from .options import PARTS, AddOptions
+from .options import PARTS, AddOptions, unread
 from .weights import find_weights
 
 MAX_POINT_FRAMES = 40
@@ -136,7 +136,7 @@ class _Job:
         if folder == self.root / "resized_mask":
             self._complete_sizes(files)
         if not missing:
-            self._say("masks: all frames have them")
+            self._say("masks: all frames have them" + unread(self.options.masks, MASKERS, "their files"))
             return
         lacking = [video for video in videos if not set(video).isdisjoint(missing)]
         for video in lacking:
@@ -239,7 +239,7 @@ class _Job:
         videos = self._videos()
         missing = {name for video in videos for name in video if find_depth(self.root, self.factor, name) is None}
         if not missing:
-            self._say("depth: all frames have it")
+            self._say("depth: all frames have it" + unread(self.options.depth, DEPTHS, "its files"))
             return
         seen_apart = self._seen_apart(videos, self.options.depth) if self.options.depth in DEPTHS else videos
         chosen = [video for video in seen_apart if not missing.isdisjoint(video)]
@@ -276,7 +276,7 @@ class _Job:
         path, frames = self.options.tracks, self.capture.film
         assert path is not None
         if read_tracks(self.root, frames) is not None:
-            self._say("tracks: they are there")
+            self._say("tracks: they are there" + unread(str(path), (), FILE))
             return
         (size, *_) = self._sizes([self.capture.train[0]])
         found = read_tracked_points(path, size)

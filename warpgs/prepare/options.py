@@ -1,6 +1,6 @@
 """Options of ``warpgs prepare``."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -132,3 +132,8 @@ class Prepare:
     """Replace an existing capture of prepare; other files are kept."""
     quiet: bool = False
     """Print errors only."""
+
+
+def unread(value: str, methods: Container[str], files: str) -> str:
+    """The end of a line that says that a file of a network was not read, because the capture has results."""
+    return "" if value in methods else f"; {value} was not read: delete {files} first to replace what is there"
