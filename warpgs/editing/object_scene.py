@@ -131,11 +131,8 @@ def with_objects(scene: TrainedScene, objects: Objects, edits: Edits) -> ObjectS
         ValueError: If edits name an object that there is not, or let one move that is static.
     """
     ids = torch.from_numpy(objects.ids).long().to(scene.device)
-    recolored = [
-        Recolored(k, _toward(scene, ids == k, color))
-        for name, *color in edits.recolor
-        for k in (number_of(objects, "recolor", name),)
-    ]
+    colors = [(number_of(objects, "recolor", name), color) for name, *color in edits.recolor]
+    recolored = [Recolored(k, _toward(scene, ids == k, color)) for k, color in colors]
     return ObjectScene(scene, ids, _retimed(scene, objects, edits), recolored)
 
 

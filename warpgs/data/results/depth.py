@@ -32,7 +32,7 @@ def read_depths(
         sizes: Width and height of each.
 
     Raises:
-        ValueError: If there is no file of a frame, or it is damaged, of other frames or of another shape.
+        ValueError: If the file of a frame is missing, damaged, or has other frames or another shape.
     """
     if path.is_dir():
         for name, size in zip(names, sizes, strict=True):

@@ -12,7 +12,7 @@ SUFFIXES = (".png", ".png.png")
 
 
 def find_given_masks(folder: Path, frames: Sequence[SourceFrame]) -> list[Path]:
-    """The mask of every frame. All must be named the same way: of a video, whose frames are no files, like the frames.
+    """The mask of every frame. All must be named the same way. Masks of a video are named like its frames.
 
     Raises:
         ValueError: If one is missing.
