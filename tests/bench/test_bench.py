@@ -212,7 +212,7 @@ def tiny_workload(sh_degree=None):
         (["--repeats", "0"], "--repeats must be at least 1"),
         (["--json", "missing/report.json"], "no such folder"),
         (["--profile", "."], "it is a folder"),
-        (["--sizes", "32x24"], "--sizes is for --scene"),
+        (["--sizes", "32x24"], "--sizes is for --scene and --fps"),
         (["--scene", "missing.ply"], "--scene missing.ply: no such file or folder"),
         (["--scene", ".", "--sizes", "32"], "--sizes must be WIDTHxHEIGHT"),
         (["--scene", ".", "--branches", "disc"], "--branches and --sh-degree are for random scenes"),
@@ -281,8 +281,13 @@ def test_frames_per_second_of_a_run_are_written(tmp_path, capsys):
     trainer = tiny.trainer(data, run, dataclasses.replace(tiny.CONFIG, data=data))
     Run.create(run, trainer.config)
     trainer.save()
-    assert main(["bench", "--device", "cpu", "--fps", str(run), "--json", str(tmp_path / "out.json")]) == 0
-    measured = json.loads((tmp_path / "out.json").read_text())["fps"]
+    report = ["--json", str(tmp_path / "out.json")]
+    assert main(["bench", "--device", "cpu", "--fps", str(run), *report]) == 0
+    (measured,) = json.loads((tmp_path / "out.json").read_text())["fps"]
     assert measured["frames_per_second"] > 0
     assert measured["static"] == len(trainer.scene.static)
+    assert (measured["width"], measured["height"]) == trainer.capture.cameras[trainer.capture.val[0]].size
     assert "frames per second" in capsys.readouterr().out
+    assert main(["bench", "--device", "cpu", "--fps", str(run), "--sizes", "16x12", "40x30", *report]) == 0
+    measured = json.loads((tmp_path / "out.json").read_text())["fps"]
+    assert [(row["width"], row["height"]) for row in measured] == [(16, 12), (40, 30)]

@@ -19,7 +19,8 @@ class Bench:
     .spz, .glb, .splat), through five cameras on a circle around it. Medians are over the cameras, too. May be repeated.
     """
     sizes: tuple[str, ...] = ()
-    """Image sizes of --scene, as WIDTHxHEIGHT; by default 480x270, on CUDA also 1920x1080 and 3840x2160."""
+    """Image sizes of --scene and --fps, as WIDTHxHEIGHT; by default 480x270 of --scene, on CUDA also 1920x1080 and
+    3840x2160, and the size of the capture of --fps."""
     device: Literal["cuda", "cpu"] | None = None
     """Device to render on; CUDA by default if there is a GPU."""
     repeats: int = 30

@@ -82,8 +82,8 @@ def check(options: Bench) -> None:
 def check_scenes(options: Bench) -> None:
     """Checks the options of random and of trained scenes; raises ValueError as ``check``."""
     _ = sizes_of(options)
-    if options.sizes and not options.scene:
-        raise ValueError("--sizes is for --scene")
+    if options.sizes and not options.scene and options.fps is None:
+        raise ValueError("--sizes is for --scene and --fps")
     if options.scene and (options.branches != "none" or options.sh_degree is not None):
         raise ValueError("--branches and --sh-degree are for random scenes: omit --scene")
     for path in options.scene:
@@ -114,7 +114,7 @@ def bench_training(options: Bench, device: str) -> list[Path]:
     if options.steps:
         report["steps"] = bench_steps(device, options.repeats, options.preset)
     if options.fps is not None:
-        report["fps"] = bench_fps(options.fps, device)
+        report["fps"] = bench_fps(options.fps, device, sizes_of(options) if options.sizes else ())
     return write((options.json, report))
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,12 @@ from warpgs.model.gaussians import SH_C0, Gaussians
 from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.runs.run import Run
+from warpgs.runs.trained import TrainedScene
 from warpgs.runtime.graphs import WARM_UPS
 from warpgs.training.losses import DepthTrust
 from warpgs.training.schedule import IterationPlan, Phase, Protocol
 from warpgs.training.step import Sample, Step
+from warpgs.video.camera_paths import filling
 from warpgs.views.views import Views
 
 from .report import print_rows
@@ -136,12 +138,26 @@ def _times(step: Step, plan: IterationPlan, device: str, repeats: int) -> Iterab
     return [milliseconds(partial(step, plan, sample), device) for sample in samples]
 
 
-def bench_fps(folder: Path, device: str) -> dict[str, Any]:
-    """Frames per second of a run's newest checkpoint through its evaluation cameras; prints and returns the results."""
+def bench_fps(folder: Path, device: str, sizes: Sequence[tuple[int, int]] = ()) -> list[dict[str, Any]]:
+    """Frames per second of a run's newest checkpoint through its evaluation cameras; prints and returns the results.
+
+    The images have the given (width, height), or without any the size of the capture.
+    """
     run = Run.open(folder, "cuda" if device == "cuda" else "cpu")
     capture, scene = run.open_capture(), run.trained_scene()
-    cameras = [capture.cameras[name].pinhole.to(scene.device) for name in capture.val or capture.train]
-    result = {
+    cameras = [capture.cameras[name].pinhole for name in capture.val or capture.train]
+    results = []
+    for size in sizes or [cameras[0].size]:
+        results.append(
+            _frames_per_second(folder, scene, [filling(camera, size).to(scene.device) for camera in cameras])
+        )
+    print_rows("frames per second, both networks evaluated for every frame", results)
+    return results
+
+
+def _frames_per_second(folder: Path, scene: TrainedScene, cameras: Sequence[Camera]) -> dict[str, Any]:
+    """Frames per second through cameras of one size."""
+    result: dict[str, Any] = {
         "run": str(folder),
         "width": cameras[0].width,
         "height": cameras[0].height,
@@ -149,7 +165,6 @@ def bench_fps(folder: Path, device: str) -> dict[str, Any]:
         "dynamic": len(scene.scene.dynamic),
         "frames_per_second": frame_rate(scene.play, cameras),
     }
-    if device == "cuda":  # on CPU both are the same
+    if scene.device.type == "cuda":  # on CPU both are the same
         result["eager_frames_per_second"] = frame_rate(scene.render, cameras)
-    print_rows("frames per second, both networks evaluated for every frame", [result])
     return result
