@@ -138,7 +138,8 @@ def test_graphs_are_measured_beside_plain_calls(monkeypatch):
     monkeypatch.setattr(measure, "capture", lambda step: step)
     workload = tiny_workload()
     times = measure.time_passes({"one_image": [workload]}, ["one_image"], "cpu", repeats=1)
-    passes = ("forward", "forward_backward", "callable_forward_backward", "graph_forward_backward")
+    graphs = ("callable_forward_backward", "graph_forward", "graph_forward_backward")
+    passes = ("forward", "forward_backward", *graphs)
     assert list(times) == [("one_image", f"{name}_ms") for name in passes]
     assert all(ms > 0 for ms in times.values())
     for ours, plain in zip(graphed(workload).forward_backward(), workload.forward_backward(), strict=True):
@@ -154,7 +155,14 @@ def test_graphs_are_captured_after_plain_calls_are_measured(monkeypatch):
     monkeypatch.setattr(measure, "capture", lambda step: order.append("graph") or step)
     monkeypatch.setattr(measure, "milliseconds", lambda step, device: order.append("call") or 1.0)
     measure.time_passes({"one_image": [tiny_workload()]}, ["one_image"], "cpu", repeats=1)
-    assert order == ["call", "call", "graph", "call", "graph", "call"]
+    assert order == ["call", "call", *["graph", "call"] * 3]
+
+
+def test_a_graph_is_compared_with_plain_calls_of_the_other_renderer():
+    ours = {"forward_ms": 2.0, "forward_backward_ms": 4.0, "graph_forward_ms": 1.0, "graph_forward_backward_ms": 2.0}
+    theirs = {"forward_ms": 6.0, "forward_backward_ms": 8.0}
+    found = measure.ratios(theirs, ours)
+    assert found == {"forward": 3.0, "forward_backward": 2.0, "graph_forward": 6.0, "graph_forward_backward": 4.0}
 
 
 @pytest.mark.parametrize("degree", range(4))

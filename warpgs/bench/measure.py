@@ -115,8 +115,9 @@ def time_passes(
     if graphs:  # last: beside a graphed callable, torch warns that plain calls may synchronise without need
         callables = {name: [graphed(workload).forward_backward for workload in workloads[name]] for name in graphs}
         times["callable_forward_backward_ms"] = time_in_turn(callables, device, repeats)
-        captured = {name: [capture(workload.forward_backward) for workload in workloads[name]] for name in graphs}
-        times["graph_forward_backward_ms"] = time_in_turn(captured, device, repeats)
+        for metric, run in (("forward_ms", Workload.forward), ("forward_backward_ms", Workload.forward_backward)):
+            captured = {name: [capture(partial(run, workload)) for workload in workloads[name]] for name in graphs}
+            times[f"graph_{metric}"] = time_in_turn(captured, device, repeats)
     return {(name, metric): ms for metric, medians in times.items() for name, ms in medians.items()}
 
 
@@ -210,9 +211,10 @@ def ratios(measured: Measurements, base: Measurements) -> Measurements:
     """Times relative to those of ``base``; without a graph, plain calls are compared with the graph of ``base``."""
     passes = ("forward", "forward_backward", "one_thread_forward_backward")
     result = {f: measured[f"{f}_ms"] / base[f"{f}_ms"] for f in passes if f"{f}_ms" in base}
-    for graph in ("callable_forward_backward", "graph_forward_backward"):
+    for graph in ("graph_forward", "callable_forward_backward", "graph_forward_backward"):
         if f"{graph}_ms" in base:
-            result[graph] = measured.get(f"{graph}_ms", measured["forward_backward_ms"]) / base[f"{graph}_ms"]
+            plain = measured[f"{graph.split('_', 1)[1]}_ms"]
+            result[graph] = measured.get(f"{graph}_ms", plain) / base[f"{graph}_ms"]
     return result
 
 

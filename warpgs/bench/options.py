@@ -34,8 +34,8 @@ class Bench:
     """Give the Gaussians colours of spherical harmonics of this degree instead of colours that are the same from all
     sides."""
     graph: bool = False
-    """Also measure forward and backward pass as CUDA graphs: one of each pass (torch.cuda.make_graphed_callables), and
-    one of both."""
+    """Also measure CUDA graphs: of the forward pass, of both passes, and one of each pass that autograd joins
+    (torch.cuda.make_graphed_callables)."""
     against: Literal["gsplat", "gswarp"] | None = None
     """Also measure another renderer, alternating with this one, and compare images and gradients."""
     json: Path | None = None

@@ -35,6 +35,8 @@ NAMES = {
     "one_thread_forward_backward": "forward and backward, one thread",
     "callable_forward_backward_ms": "forward and backward, graphed callable [ms]",
     "callable_forward_backward": "forward and backward, graphed callable",
+    "graph_forward_ms": "forward, CUDA graph [ms]",
+    "graph_forward": "forward, CUDA graph",
     "graph_forward_backward_ms": "forward and backward, CUDA graph [ms]",
     "graph_forward_backward": "forward and backward, CUDA graph",
     "stages_ms": "pass [ms]:",
