@@ -22,7 +22,7 @@ CUDA_LANES_LOG2 = 2
 def make_encode(half: bool) -> wp.Kernel:
     """Kernel that writes the columns of x, y, z or t of a row, in half or single precision.
 
-    Rows after the last position are copies of the last one.
+    Rows after the last position or time have the last one.
 
     2^``lanes_log2`` threads share these columns, one frequency at a time: neighbouring threads on CUDA, which write
     neighbouring addresses, and one thread on CPU. ``begin_column`` is the first column of the encoding; ``raw`` is 1 if
@@ -53,7 +53,7 @@ def make_encode(half: bool) -> wp.Kernel:
         dims = 3
         bands = position_bands
         begin = begin_column
-        p = time[0]
+        p = time[wp.min(row, time.shape[0] - 1)]
         if axis < 3:
             p = (means[wp.min(row, means.shape[0] - 1), axis] - center[axis]) / half_size[axis]
         else:

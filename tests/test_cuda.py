@@ -436,3 +436,11 @@ def test_after_an_error_in_a_capture_it_is_reported_and_the_next_capture_works()
         record(fail)
     (total,) = capture(lambda: (torch.ones(3, device=device).sum(),))()
     assert total == 3
+
+
+def test_points_have_the_same_depths_and_pixels():
+    points, camera = torch.randn(1000, 3, generator=generator(2)), make_camera()
+    expected, found = camera.project(points), camera.to("cuda").project(points.cuda())
+    assert relative_error(found[2].cpu(), expected[2]) < 1e-6
+    assert sum(int((a != b.cpu()).sum()) for a, b in zip(expected[:2], found[:2], strict=True)) <= 4  # at borders
+    assert torch.equal(expected[3], found[3].cpu())

@@ -64,3 +64,10 @@ def test_a_state_brings_the_numbers_of_its_paths_and_points(model):
 def test_a_state_whose_paths_are_no_splines_is_refused(model, shape):
     with pytest.raises(RuntimeError, match="paths"):
         model.load_state_dict({**model.state_dict(), "paths": torch.zeros(shape)})
+
+
+def test_gaussians_may_have_their_own_times(model):
+    means, times = torch.randn(6, 3, generator=generator()), torch.linspace(-0.1, 1.1, 6)
+    offsets = model(means, times)
+    for k in range(6):
+        assert error(offsets[k], model(means, times[k : k + 1])[k]) < 1e-6

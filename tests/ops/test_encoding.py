@@ -121,3 +121,17 @@ def test_positions_of_a_wrong_type_or_layout_are_refused(means):
 def test_a_time_of_a_wrong_type_is_refused():
     with pytest.raises(ValueError, match="time must"):
         encode_unit_box(random_means(4), 2, 2, time=TIME.double())
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_each_row_may_have_its_own_time(half):
+    means, times = random_means(5), torch.linspace(0.1, 0.9, 5)
+    encoded = encode_unit_box(means, 3, 2, time=times, half=half)
+    for k, row in enumerate(encoded[:5]):
+        assert torch.equal(row, encode_unit_box(means, 3, 2, time=times[k : k + 1], half=half)[k])
+    assert torch.equal(encoded[5:], encoded[4:5].expand(len(encoded) - 5, -1))
+
+
+def test_another_number_of_times_than_of_positions_is_refused():
+    with pytest.raises(ValueError, match="time must"):
+        encode_unit_box(random_means(4), 2, 2, time=torch.zeros(3))

@@ -19,9 +19,10 @@ FIELDS: dict[str, type[nn.Module]] = {
 """Deformation models by name.
 
 Each is a ``torch.nn.Module`` that is constructed as ``Model(config, center, half_size)`` from a ``ModelConfig`` and the
-[3] box of the scene, and called as ``model(means, time)`` with [N, 3] canonical positions and a [1] time in [0, 1]. It
-returns [N, 10] offsets: of positions (3), of rotations as an addition to the unit quaternion (4), and of log-scales
-(3). Offsets are 0 at first. Parameters have single precision and are created on the device of ``center``.
+[3] box of the scene, and called as ``model(means, time)`` with [N, 3] canonical positions and a [1] time in [0, 1] of
+all or [N] times of each. It returns [N, 10] offsets: of positions (3), of rotations as an addition to the unit
+quaternion (4), and of log-scales (3). Offsets are 0 at first. Parameters have single precision and are created on the
+device of ``center``.
 """
 
 

@@ -24,7 +24,7 @@ class MlpDeformation(nn.Module):
         self.trunk = Trunk(config, center, half_size, outputs=(10,))
         self.register_buffer("units", torch.ones(10, dtype=center.dtype, device=center.device))
 
-    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N 10"]:
-        """Offsets; see ``fields.FIELDS``. No gradient flows to ``means``, as in Deformable-3DGS."""
+    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, " T"]) -> Float[Tensor, "N 10"]:
+        """Offsets at one time or at N; see ``fields.FIELDS``. No gradient flows to ``means``, as in Deformable-3DGS."""
         (offsets,) = self.trunk(means, time)
         return offsets * self.units

@@ -48,18 +48,27 @@ class SplineDeformation(nn.Module):
             self.resize(*paths.shape[:2])
         super()._load_from_state_dict(state_dict, prefix, *args)
 
-    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N 10"]:
-        """Offsets; see ``fields.FIELDS``. No gradient flows to ``means``."""
+    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, " T"]) -> Float[Tensor, "N 10"]:
+        """Offsets at one time or at N; see ``fields.FIELDS``. No gradient flows to ``means``."""
         nearest = torch.cdist(means.detach(), self.homes).argmin(1)
         # The backward pass of indexing by brackets is 20 times as slow where few rows are chosen often.
-        moved = (self.positions(time) - self.homes).index_select(0, nearest)
-        return self.network(means, time) + nn.functional.pad(moved, (0, 7))
+        homes = self.homes.index_select(0, nearest)
+        if len(time) == 1:
+            positions = self.positions(time).index_select(0, nearest)
+        else:
+            positions = self.positions(time, self.paths.index_select(0, nearest))
+        return self.network(means, time) + nn.functional.pad(positions - homes, (0, 7))
 
-    def positions(self, time: Float[Tensor, "1"]) -> Float[Tensor, "K 3"]:
-        """Positions of the objects at a time; outside [0, 1], the first or last piece of the splines goes on."""
-        pieces = self.paths.shape[1] - 3
+    def positions(self, time: Float[Tensor, " T"], paths: Float[Tensor, "M C 3"] | None = None) -> Float[Tensor, "M 3"]:
+        """Positions on paths, by default those of all objects, at one time or at M.
+
+        Outside [0, 1], the first or last piece of the splines goes on.
+        """
+        paths = self.paths if paths is None else paths
+        pieces = paths.shape[1] - 3
         first = (time * pieces).floor().clamp(0, pieces - 1)
         f = time * pieces - first
-        weights = torch.cat([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3]) / 6
-        points = self.paths.index_select(1, first.long() + torch.arange(4, device=time.device))
-        return (points * weights[:, None]).sum(1) * self.network.units[:3]
+        weights = torch.stack([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3], 1) / 6
+        chosen = first.long()[:, None] + torch.arange(4, device=time.device)
+        points = paths.gather(1, chosen[:, :, None].expand(len(paths), 4, 3))
+        return (points * weights[:, :, None]).sum(1) * self.network.units[:3]

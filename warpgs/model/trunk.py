@@ -54,8 +54,8 @@ class Trunk(nn.Module):
         layers = split(values, self.shapes)
         return [Layer(weight[:r, :c], bias[:r]) for (weight, bias), (r, c) in zip(layers, self.sizes, strict=True)]
 
-    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> tuple[Tensor, ...]:
-        """Evaluates the network at N positions and one time in [0, 1]: [N, number] for each of ``outputs``.
+    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, " T"]) -> tuple[Tensor, ...]:
+        """Evaluates the network at N positions and one or N times in [0, 1]: [N, number] for each of ``outputs``.
 
         No gradient flows to the positions.
         """

@@ -18,7 +18,7 @@ ROW_ALIGNMENT = 64
 
 def encode(
     means: Float[Tensor, "N 3"],
-    time: Float[Tensor, "1"],
+    time: Float[Tensor, " T"],
     bands: tuple[int, int],
     box: tuple[Float[Tensor, "3"], Float[Tensor, "3"]],
     offset: int = 0,
@@ -29,7 +29,7 @@ def encode(
 
     Args:
         means: [N, 3] positions.
-        time: [1] time in [0, 1], of all positions.
+        time: [1] time in [0, 1] of all positions, or [N] times of each.
         bands: Numbers L of frequencies of positions and of time; the lowest frequency has wavelength 2.
         box: Center and half size, [3] each, of the box that is mapped to [-1, 1]³.
         offset: Number of columns before the encoding, left uninitialised.
@@ -44,8 +44,10 @@ def encode(
         ValueError: On a wrong shape, dtype or device.
     """
     tensors = {"means": means, "time": time, "center": box[0], "half_size": box[1]}
-    for (name, tensor), shape in zip(tensors.items(), (("N", 3), (1,), (3,), (3,)), strict=True):
-        check_tensor(name, tensor, shape, {})
+    times = "N" if len(time) != 1 else 1
+    sizes: dict[str, int] = {}
+    for (name, tensor), shape in zip(tensors.items(), (("N", 3), (times,), (3,), (3,)), strict=True):
+        check_tensor(name, tensor, shape, sizes)
     check_same_device(tensors)
     columns = aligned(encoded_size(*bands, raw))
     rows = aligned(len(means), ROW_ALIGNMENT) if half else len(means)
