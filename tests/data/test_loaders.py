@@ -213,12 +213,17 @@ def test_without_distortion_cameras_are_pinholes_that_look_at_their_centre(tmp_p
 
 
 def test_only_depth_of_a_sensor_is_metric(iphone, tmp_path):
+    scale = json.loads((iphone / "scene.json").read_text())["scale"]
     assert load_capture(iphone).metric_depth
-    assert not load_capture(write_capture(tmp_path / "other")).metric_depth
+    assert load_capture(iphone).metres == pytest.approx(1 / scale)
+    other = load_capture(write_capture(tmp_path / "other"))
+    assert not other.metric_depth
+    assert other.metres is None
     shutil.copy(iphone / "depth/2x/0_00000.npy", tmp_path / "kept.npy")
     (iphone / "depth/2x/0_00000.npy").unlink()
     captures.write_png(iphone / "depth/2x/0_00000.png", np.full((12, 20), 100, np.uint8))
     assert not load_capture(iphone).metric_depth
+    assert load_capture(iphone).metres is None
 
 
 def test_captures_of_two_cameras_have_a_factor_of_their_own_as_in_the_preset_paper(hypernerf):

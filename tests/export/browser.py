@@ -52,6 +52,7 @@ class Browser:
         os.close(commands)
         os.close(answers)
         self._received, self._last, self.events, self._session = b"", 0, [], None
+        self._first = None
         self._size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
 
     def __enter__(self):
@@ -69,7 +70,13 @@ class Browser:
         for domain in ("Network", "Runtime", "Log", "Page"):
             self.call(f"{domain}.enable")
         self.call("Emulation.setDeviceMetricsOverride", **self._size)
+        if self._first is not None:
+            self.call("Page.addScriptToEvaluateOnNewDocument", source=self._first)
         self.call("Page.navigate", url=address)
+
+    def on_open(self, script):
+        """Runs a script before those of pages that are opened from now on."""
+        self._first = script
 
     def call(self, method, **parameters):
         self._last += 1

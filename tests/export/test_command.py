@@ -160,6 +160,10 @@ def test_a_page_follows_the_training_cameras(run, data):
     assert start.viewmat == path[2].viewmat.tolist()
     assert start.intrinsics[0] == float(path[2].K[0, 0])
     assert start.title == "the run"
+    assert start.up == tuple(orientation.vertical(capture))
+    assert start.metres is None
+    known = dataclasses.replace(capture, metres=2.5)
+    assert start_view(clouds_of(run), known, keys=1, seconds=2.0).metres == 2.5
     assert all(start.filmed.outside(*position_and_axis(camera)) < 1 for camera in path)
 
 

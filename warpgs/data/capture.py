@@ -136,6 +136,7 @@ class Capture:
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         conventions: What its files mean.
         is_builtin: Whether the package makes it: then no advice to change its files makes sense.
+        metres: Metres per scene unit; None if that is not known.
         tracks: Points that a network followed through the frames of ``film``; None without any.
         notes: Remarks of the loader on files that it skipped or had to interpret, one sentence each.
         assumption: What is taken as dynamic; see ``assuming``.
@@ -163,6 +164,7 @@ class Capture:
     readout: float = 0.0
     layout: str = ""
     tracks: Tracks | None = None
+    metres: float | None = None
     conventions: Conventions = field(default_factory=Conventions)
     assumption: Assumption = field(init=False)
     has_empty: bool = field(init=False)

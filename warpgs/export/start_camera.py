@@ -11,9 +11,11 @@ from warpgs.config import Color
 from warpgs.data.capture import COLORS, Capture, background_color
 from warpgs.formats.cloud import Cloud
 from warpgs.video import camera_paths
+from warpgs.video.camera_paths import UP
 from warpgs.video.filmed import Filmed
 
 from .clouds import Clouds
+from .orientation import vertical
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,8 @@ class StartView:
         seconds: Duration of the scene [s].
         antialias, max_alpha: As in ``RenderSettings``.
         background: Colour behind everything, in [0, 1].
+        up: Upward direction of the room, for headsets [scene coordinates].
+        metres: Metres per scene unit; None if that is not known.
         filmed: What the training cameras have filmed; None if they are not known.
     """
 
@@ -44,6 +48,8 @@ class StartView:
     antialias: bool
     max_alpha: float
     background: Color = COLORS["black"]
+    up: tuple[float, ...] = UP
+    metres: float | None = None
     filmed: Filmed | None = None
 
 
@@ -60,11 +66,11 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
     cloud = cloud.select(cloud.finite)
     track: list[Camera] = []
     camera = camera_paths.default_camera(camera_paths.BoundingSphere.around(_means(cloud)))
-    filmed = None
+    filmed, up, metres = None, UP, None
     if capture is not None:
         track = [] if camera_paths.jumps(capture) else camera_paths.training_path(capture, keys)
         camera = track[len(track) // 2] if track else capture.cameras[camera_paths.middle_view(capture)].pinhole
-        filmed = Filmed.by(capture, _means(cloud))
+        filmed, up, metres = Filmed.by(capture, _means(cloud)), tuple(vertical(capture).tolist()), capture.metres
     K = camera.K.tolist()
     dynamic = cloud.select(cloud.is_dynamic)
     config = clouds.scene.config
@@ -79,6 +85,8 @@ def start_view(clouds: Clouds, capture: Capture | None, keys: int, seconds: floa
         antialias=config.antialias,
         max_alpha=config.max_alpha,
         background=background_color(config.background),
+        up=up,
+        metres=metres,
         filmed=filmed,
     )
 

@@ -78,7 +78,7 @@ class NerfiesLoader(ABC):
         return images.read_depth(path, size, image)
 
     def has_metric_depth(self, paths: Iterable[Path]) -> bool:
-        """Whether the inverse depth of files has scene units and no offset."""
+        """Whether files hold depth in metres, the unit of the cameras, so that inverse depth has no offset."""
         return False
 
     def load(self, root: Path, options: LoadOptions, incomplete_masks: bool = False) -> Capture:
@@ -98,7 +98,8 @@ class NerfiesLoader(ABC):
         points, colors = read_points(root, units)
         read_depth = partial(_read_depth, self, units)
         reader = _FrameReader(cameras, lenses, files, frozenset(split.train), options.perturbation, read_depth)
-        depths = [files[name].depth for name in split.train]
+        depths = [depth for name in split.train if (depth := files[name].depth) is not None]
+        metric_depth = self.has_metric_depth(depths)
         listed = f"the split of {split.source.name} uses them neither for training nor for evaluation"
         return Capture(
             root.resolve().name,
@@ -109,7 +110,8 @@ class NerfiesLoader(ABC):
             colors,
             reader.read,
             options.cache_frames,
-            metric_depth=self.has_metric_depth(path for path in depths if path is not None),
+            metric_depth=metric_depth,
+            metres=1.0 / units.scale if depths and metric_depth else None,
             estimated_masks=_are_estimates(root / "dataset.json", dataset) and any(f.mask for f in files.values()),
             time_source=time_source,
             readout=float(read_numbers(root / "dataset.json", {"readout": 0.0, **dataset}, "readout", ())),

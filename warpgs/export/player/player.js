@@ -117,20 +117,25 @@ function resized() {
   state.changed = true;
 }
 
-function render(camera, position) {
-  const [width, height] = START.size, [fx, fy, cx, cy] = START.intrinsics;
-  const zoom = Math.min(canvas.width / width, canvas.height / height);
-  const r = camera.rotation, t = r.map((row) => -dot(row, camera.position));
-  gl.viewport(0, 0, canvas.width, canvas.height);
-  gl.clearColor(...START.background, 1);
-  gl.clear(gl.COLOR_BUFFER_BIT);
-  gl.uniform1f(uniforms.position, position);
-  gl.uniform2f(uniforms.viewport, canvas.width, canvas.height);
-  gl.uniform4f(uniforms.intrinsics, fx * zoom, fy * zoom,
-    canvas.width / 2 + (cx - width / 2) * zoom, canvas.height / 2 + (cy - height / 2) * zoom);
+function draw({rotation: r, position}, [fx, fy, cx, cy], [left, bottom, width, height]) {
+  // Draws the sorted Gaussians through a camera into a part of the framebuffer, from whose upper left corner cx, cy count.
+  const t = r.map((row) => -dot(row, position));
+  gl.viewport(left, bottom, width, height);
+  gl.uniform1f(uniforms.position, state.time * lastKey);
+  gl.uniform2f(uniforms.viewport, width, height);
+  gl.uniform4f(uniforms.intrinsics, fx, fy, cx, cy);
   gl.uniformMatrix4fv(uniforms.view, false,
     [r[0][0], r[1][0], r[2][0], 0, r[0][1], r[1][1], r[2][1], 0, r[0][2], r[1][2], r[2][2], 0, ...t, 1]);
   gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, state.count);
+}
+
+function render(camera) {
+  const [width, height] = START.size, [fx, fy, cx, cy] = START.intrinsics;
+  const zoom = Math.min(canvas.width / width, canvas.height / height);
+  const center = [canvas.width / 2 + (cx - width / 2) * zoom, canvas.height / 2 + (cy - height / 2) * zoom];
+  gl.clearColor(...START.background, 1);
+  gl.clear(gl.COLOR_BUFFER_BIT);
+  draw(camera, [fx * zoom, fy * zoom, ...center], [0, 0, canvas.width, canvas.height]);
 }
 
 const uniforms = Object.fromEntries(['position', 'viewport', 'intrinsics', 'view'].map((name) => [name, uniform(name)]));
@@ -147,32 +152,47 @@ worker.onmessage = ({data}) => {
 
 let before = performance.now(), sortedFor = '';
 document.addEventListener('visibilitychange', () => { before = performance.now(); }); // a hidden page is paused
-function frame(now) {
+function advance(now) {
   const elapsed = Math.max(0, now - before) / 1000; // slow machines skip times; playback keeps its speed
   before = now;
   if (state.playing && lastKey > 0) {
     state.time = (state.time + elapsed * Number(element('speed').value) / START.seconds) % 1;
     state.changed = true;
   }
+  return elapsed;
+}
+
+function sortFor(camera) {
+  // Asks for the order of the Gaussians at this time, unless it is known; returns whether it was asked for.
+  const position = state.time * lastKey, z = camera.rotation[2], shown = NAMES.map((name) => element(name).checked);
+  const key = JSON.stringify([camera, position, shown]);
+  if (!state.sorting && key !== sortedFor) {
+    state.sorting = true;
+    sortedFor = key;
+    worker.postMessage({view: [...z, -dot(z, camera.position)], position, shown});
+  }
+  return key === sortedFor;
+}
+
+function showTime() {
+  element('time').value = state.time;
+  element('clock').textContent = `${(state.time * START.seconds).toFixed(2)} / ${START.seconds.toFixed(1)} s`;
+  element('play').textContent = state.playing ? 'pause' : 'play';
+}
+
+function frame(now) {
+  advance(now);
   resized();
   if (state.changed || !state.rendered) {
-    const camera = currentCamera(), position = state.time * lastKey, z = camera.rotation[2];
-    const shown = NAMES.map((name) => element(name).checked), key = JSON.stringify([camera, position, shown]);
-    if (!state.sorting && key !== sortedFor) {
-      state.sorting = true;
-      sortedFor = key;
-      worker.postMessage({view: [...z, -dot(z, camera.position)], position, shown});
-    }
-    render(camera, position);
-    state.changed = key !== sortedFor;
+    const camera = currentCamera();
+    state.changed = !sortFor(camera);
+    render(camera);
     state.rendered = true;
     if (state.sorted) document.body.dataset.state = state.sorting || state.changed ? 'playing' : 'settled';
-    element('time').value = state.time;
-    element('clock').textContent = `${(state.time * START.seconds).toFixed(2)} / ${START.seconds.toFixed(1)} s`;
-    element('play').textContent = state.playing ? 'pause' : 'play';
+    showTime();
     element('outside').hidden = !FILMED || outsideOf(FILMED, camera) <= 1;
   }
-  requestAnimationFrame(frame);
+  state.request = requestAnimationFrame(frame);
 }
 
 upload().then((means) => {
@@ -183,5 +203,5 @@ upload().then((means) => {
   gl.enable(gl.BLEND);
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   worker.postMessage({means});
-  requestAnimationFrame(frame);
+  state.request = requestAnimationFrame(frame);
 }).catch((error) => fail(`The scene could not be shown: ${error.message}`));
