@@ -148,6 +148,10 @@ def test_positional_arguments_have_names(command, metavars, capsys):
             "warpgs train: error parsing --model.appearance-size: expected INT INT, got '4'\n",
         ),
         (["train", "--no-dap"], "warpgs train: there is no option --no-dap any more: --omit dap omits it\n"),
+        (
+            ["render", "r", "--freeze", "1", "abc"],
+            "warpgs render: error parsing --freeze: expected NAME FLOAT, got '1', 'abc'\n",
+        ),
         (["report", "r", "--views", "x"], "warpgs report: error parsing --views: expected INT, got 'x'"),
         (["prepare", "v", "c", "--start", "x"], "warpgs prepare: error parsing --start: expected FLOAT, got 'x'"),
         (["train", "--preset", "x"], "warpgs train: --preset must be one of best, paper, patient, quick, got 'x'\n"),

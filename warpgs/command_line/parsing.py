@@ -56,6 +56,12 @@ def _choices(match: re.Match[str]) -> str:
     return not_one_of(match["option"], given, choices)
 
 
+def _of_types(match: re.Match[str]) -> str:
+    """What the values of an option of several had to be, in the words of ``METAVARS``."""
+    names = {kind.__name__: shown for kind, shown in METAVARS.items()}
+    return f"expected {' '.join(names.get(kind, kind) for kind in match[2].split(', '))}, got {match[1]}"
+
+
 EMPTY_ROW = re.compile(r"^(?:\x1b\[[0-9;]*m|[│| ])*│(?:\x1b\[[0-9;]*m)*\n", re.MULTILINE)
 """A row of tyro's boxes without text, which follows one that is full."""
 
@@ -75,6 +81,7 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
         r"""^argument (?P<option>\S+): invalid choice: (?P<literal>'.*'|".*") \(choose from (?P<choices>.*)\)$""",
         _choices,
     ),
+    (r"Could not parse arguments \[(.*)\] into tuple type tuple\[(.*)\]", _of_types),
     (r"^Missing value for argument '(\S+?)'.*", r"missing value for \1"),
     (
         r"no type matching \{None\}\|\{?([A-Z ]+?)\}? could be instantiated from \[(.*?)\]\..*",
