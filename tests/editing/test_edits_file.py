@@ -1,5 +1,6 @@
 """The file of edits: read back as written, bounded, and used by all commands."""
 
+import dataclasses
 import json
 import shutil
 
@@ -7,16 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from tests import tiny
 from tests.data.captures import edit_json
-from tests.export.scenes import refusal
+from tests.export.scenes import refusal, trained_scene
 from warpgs.cli import main
 from warpgs.editing.edits_file import MAX_BYTES, NAME, NONE, edits_in_use, read_edits, save_edits
-from warpgs.editing.objects import NAME as OBJECTS
+from warpgs.editing.objects import write_objects
 from warpgs.editing.options import Editing, Edits
+from warpgs.files import write_json
 from warpgs.formats.standard import read_standard
 from warpgs.runs import checkpoint
 from warpgs.runs.run import Run
+from warpgs.runs.trained import TrainedScene
 from warpgs.viewer.source import open_source
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -40,6 +42,17 @@ def run(finished_run, tmp_path):
     return shutil.copytree(finished_run, tmp_path / "run")
 
 
+@pytest.fixture(scope="module")
+def scene():
+    return trained_scene()
+
+
+def one_object(run):
+    """Stores that all dynamic Gaussians of a run are object 1."""
+    scene = Run.open(run, "cpu").trained_scene()
+    write_objects(scene, run, np.ones(len(scene.scene.dynamic), np.int32))
+
+
 def count(run):
     """The number of Gaussians in a file that is exported, with a run's edits."""
     assert main(["export", str(run), "--quiet", "--up", "scene", "--out", str(run.parent / "out")]) == 0
@@ -47,37 +60,37 @@ def count(run):
 
 
 @pytest.mark.parametrize("edits", [ALL, Edits(), Edits(min_opacity=0.5)])
-def test_a_file_of_edits_is_read_back_as_it_was_written(tmp_path, edits):
-    assert read_edits(save_edits(tmp_path, Editing(), edits)) == edits
+def test_a_file_of_edits_is_read_back_as_it_was_written(tmp_path, scene, edits):
+    assert read_edits(save_edits(tmp_path, Editing(), edits, scene)) == edits
 
 
-def test_a_file_of_edits_holds_only_those_that_are_made(tmp_path):
-    path = save_edits(tmp_path, Editing(), Edits(min_opacity=0.5))
+def test_a_file_of_edits_holds_only_those_that_are_made(tmp_path, scene):
+    path = save_edits(tmp_path, Editing(), Edits(min_opacity=0.5), scene)
     assert json.loads(path.read_text()) == {"format": "warpgs edits", "version": 1, "min_opacity": 0.5}
 
 
-def test_a_run_without_a_file_of_edits_has_none(tmp_path):
-    assert edits_in_use(tmp_path, Editing()) == Edits()
+def test_a_run_without_a_file_of_edits_has_none(tmp_path, scene):
+    assert edits_in_use(tmp_path, Editing(), scene) == Edits()
 
 
-def test_an_edit_that_is_given_replaces_the_one_in_the_file(tmp_path):
-    save_edits(tmp_path, Editing(), Edits(min_opacity=0.5, max_gaussians=7))
+def test_an_edit_that_is_given_replaces_the_one_in_the_file(tmp_path, scene):
+    save_edits(tmp_path, Editing(), Edits(min_opacity=0.5, max_gaussians=7), scene)
     expected = Edits(min_opacity=0.25, max_gaussians=7)
-    assert edits_in_use(tmp_path, Editing(Edits(min_opacity=0.25))) == expected
+    assert edits_in_use(tmp_path, Editing(Edits(min_opacity=0.25)), scene) == expected
 
 
-def test_another_file_can_be_named_or_none(tmp_path):
-    save_edits(tmp_path, Editing(), ALL)
-    other = save_edits(tmp_path, Editing(edits=tmp_path / "other.json"), Edits(max_gaussians=3))
-    assert edits_in_use(tmp_path, Editing(edits=other)) == Edits(max_gaussians=3)
-    assert edits_in_use(tmp_path, Editing(edits=NONE)) == Edits()
+def test_another_file_can_be_named_or_none(tmp_path, scene):
+    save_edits(tmp_path, Editing(), ALL, scene)
+    other = save_edits(tmp_path, Editing(edits=tmp_path / "other.json"), Edits(max_gaussians=3), scene)
+    assert edits_in_use(tmp_path, Editing(edits=other), scene) == Edits(max_gaussians=3)
+    assert edits_in_use(tmp_path, Editing(edits=NONE), scene) == Edits()
     with pytest.raises(ValueError, match="--edits cannot be none"):
-        save_edits(tmp_path, Editing(edits=NONE), ALL)
+        save_edits(tmp_path, Editing(edits=NONE), ALL, scene)
 
 
-def test_a_file_that_is_named_must_exist(tmp_path):
+def test_a_file_that_is_named_must_exist(tmp_path, scene):
     with pytest.raises(ValueError, match=r"gone\.json is missing"):
-        edits_in_use(tmp_path, Editing(edits=tmp_path / "gone.json"))
+        edits_in_use(tmp_path, Editing(edits=tmp_path / "gone.json"), scene)
 
 
 @pytest.mark.parametrize(
@@ -103,16 +116,82 @@ def test_a_file_that_is_named_must_exist(tmp_path):
         ({"freeze": [["1", 2]]}, "--freeze 1 must be in"),
         ({"box": [["table", 0, 0, 0, 1, 1]]}, "box must be finite numbers of shape"),
         ({"objects": 2}, "objects cannot be 2"),
+        ({"checkpoint": 7}, "checkpoint must have an iteration and a fingerprint, got 7"),
+        ({"checkpoint": {"iteration": 7}}, "checkpoint must have an iteration and a fingerprint"),
+        ({"checkpoint": {"iteration": "7", "fingerprint": "a"}}, "checkpoint must have an iteration"),
         ({"max_gaussians": -1}, "--max-gaussians must be at least 1"),
     ],
 )
-def test_a_file_with_other_values_is_refused_by_its_name(tmp_path, changes, message):
-    path = save_edits(tmp_path, Editing(), ALL)
+def test_a_file_with_other_values_is_refused_by_its_name(tmp_path, scene, changes, message):
+    path = save_edits(tmp_path, Editing(), ALL, scene)
     edit_json(path, **changes)
     refused = refusal(read_edits, path)
     assert refused is not None
     assert str(path) in refused
     assert message in refused
+
+
+def refused_use(folder, editing, scene):
+    """Why the edits of a run folder are refused for a scene."""
+    return str(refusal(lambda path: edits_in_use(path, editing, scene), folder))
+
+
+def retrained(scene, iteration):
+    """The scene with the Gaussians of another training."""
+    other = trained_scene(seed=1)
+    return TrainedScene(other.scene, other.config, dataclasses.replace(scene.metadata, iteration=iteration))
+
+
+@pytest.mark.parametrize(
+    ("edits", "further", "reason"),
+    [
+        (Edits(remove="0,2"), 5, "has numbers of objects at iteration {}, but the run is at {}"),
+        (Edits(freeze=(("1", 0.5),)), 0, "has numbers of objects of another training up to iteration {}"),
+    ],
+)
+def test_saved_numbers_of_objects_are_refused_for_other_gaussians(tmp_path, scene, edits, further, reason):
+    path, iteration = save_edits(tmp_path, Editing(), edits, scene), scene.metadata.iteration
+    assert edits_in_use(tmp_path, Editing(), scene) == edits
+    refused = refused_use(tmp_path, Editing(), retrained(scene, iteration + further))
+    assert refused.startswith(f"{path} {reason.format(iteration, iteration + further)}: ")
+    assert "--edits none --layers objects, and delete the file" in refused
+
+
+def test_numbers_of_objects_without_their_checkpoint_are_refused(tmp_path, scene):
+    write_json(tmp_path / NAME, {"format": "warpgs edits", "version": 1, "remove": "2"})
+    assert "does not say which checkpoint" in refused_use(tmp_path, Editing(), scene)
+
+
+@pytest.mark.parametrize("saved", [Edits(objects="0,table", min_opacity=0.5), Edits(remove="0"), Edits(crop=ALL.crop)])
+def test_saved_edits_without_numbers_are_for_all_checkpoints(tmp_path, scene, saved):
+    save_edits(tmp_path, Editing(), saved, scene)
+    assert edits_in_use(tmp_path, Editing(), retrained(scene, 99)) == saved
+
+
+def test_a_given_list_of_objects_replaces_a_saved_one_of_another_checkpoint(tmp_path, scene):
+    save_edits(tmp_path, Editing(), Edits(remove="2", min_opacity=0.5), scene)
+    expected = Edits(remove="1", min_opacity=0.5)
+    assert edits_in_use(tmp_path, Editing(Edits(remove="1")), retrained(scene, 99)) == expected
+
+
+@pytest.mark.parametrize(
+    ("given", "saved", "message"),
+    [
+        (Edits(objects="1", recolor=(("2", 1.0, 0.0, 0.0),)), Edits(), "--recolor 2 would change nothing"),
+        (Edits(freeze=(("2", 0.5),)), Edits(objects="0, 1"), "because --objects 0, 1 removes it: add 2 to --objects"),
+        (Edits(shift=(("2", 0.5),)), Edits(remove="1,2"), "because --remove 1,2 removes it"),
+    ],
+)
+def test_a_change_of_an_object_that_is_removed_is_refused(tmp_path, scene, given, saved, message):
+    save_edits(tmp_path, Editing(), saved, scene)
+    assert message in refused_use(tmp_path, Editing(given), scene)
+
+
+def test_objects_with_saved_changes_can_be_left_out(tmp_path, scene):
+    saved = Edits(recolor=(("1", 1.0, 0.0, 0.0), ("2", 0.0, 1.0, 0.0)))
+    save_edits(tmp_path, Editing(), saved, scene)
+    edits = edits_in_use(tmp_path, Editing(Edits(objects="1")), scene)
+    assert edits == dataclasses.replace(saved, objects="1")
 
 
 def test_a_large_file_is_refused(tmp_path):
@@ -174,7 +253,7 @@ def test_all_edits_can_be_given_on_the_command_line(run, capsys):
 
 
 def test_a_switch_that_is_given_as_off_replaces_the_one_in_the_file(run, capsys):
-    save_edits(run, Editing(), Edits(drop_floaters=True, max_gaussians=9))
+    save_edits(run, Editing(), Edits(drop_floaters=True, max_gaussians=9), trained_scene())
     assert main(["export", str(run), "--quiet", "--no-drop-floaters", "--save-edits"]) == 0
     assert read_edits(run / NAME) == Edits(max_gaussians=9)
     assert main(["export", str(run), "--quiet", "--drop-floaters", "--save-edits"]) == 0
@@ -182,8 +261,7 @@ def test_a_switch_that_is_given_as_off_replaces_the_one_in_the_file(run, capsys)
 
 
 def test_files_at_all_times_have_a_frozen_object_as_it_was(run, tmp_path):
-    count = len(Run.open(run, "cpu").trained_scene().scene.dynamic)
-    np.savez(run / OBJECTS, iteration=tiny.LENGTH, ids=np.ones(count, np.int32))
+    one_object(run)
     means = []
     for name, *freeze in (("moves",), ("frozen", "--freeze", "1", "0.0")):
         out = tmp_path / name

@@ -155,3 +155,13 @@ def test_lines_about_objects_name_those_in_boxes(scene, tmp_path):
 def test_edits_of_objects_that_cannot_be_made_are_refused(scene, edits, message):
     with pytest.raises(ValueError, match=message):
         edited(scene, edits)
+
+
+@pytest.mark.parametrize(
+    ("count", "reason"),
+    [(0, "nothing in this scene is dynamic"), (3, "no group of the 3 dynamic Gaussians stays together")],
+)
+def test_why_there_are_no_objects_is_said(count, reason):
+    message = f"the objects of this scene are: none, because {reason}; --box makes one of static Gaussians"
+    with pytest.raises(ValueError, match=message):
+        edited(moving.scene(count, 0), Edits(remove="1"))

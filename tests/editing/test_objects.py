@@ -11,7 +11,8 @@ from tests.editing import moving
 from tests.export import scenes
 from warpgs.config import presets
 from warpgs.config.options import scaled
-from warpgs.editing.objects import NAME, find_objects, stored_objects
+from warpgs.editing.identity import identity_of
+from warpgs.editing.objects import NAME, find_objects, known_objects, stored_objects
 from warpgs.runs.trained import TrainedScene
 from warpgs.synthetic import studio
 
@@ -85,6 +86,20 @@ def test_objects_of_a_newer_checkpoint_are_found_anew(tmp_path):
     assert np.array_equal(stored_objects(newer, tmp_path)[0], find_objects(newer))
 
 
+def test_objects_of_another_training_of_the_same_length_are_found_anew(tmp_path):
+    scene = moving.scene()
+    stored_objects(scene, tmp_path)
+    scene.scene.dynamic.means.copy_(scene.scene.dynamic.means.flip(0).clone())
+    assert np.array_equal(stored_objects(scene, tmp_path)[0], find_objects(scene))
+
+
+def test_a_file_without_a_fingerprint_is_written_anew(tmp_path):
+    scene = moving.scene()
+    np.savez(tmp_path / NAME, iteration=32, ids=np.zeros(350, np.int32))
+    assert stored_objects(scene, tmp_path)[0].max() == 2
+    assert known_objects(scene, tmp_path).max() == 2
+
+
 def test_a_damaged_file_of_objects_is_refused_by_its_name(tmp_path):
     (tmp_path / NAME).write_bytes(b"PK\3\4 damaged")
     with pytest.raises(ValueError, match=r"objects\.npz"):
@@ -102,9 +117,11 @@ def test_a_damaged_file_of_objects_is_refused_by_its_name(tmp_path):
     ],
 )
 def test_a_file_with_other_numbers_is_refused_by_its_name(tmp_path, iteration, ids):
-    np.savez(tmp_path / NAME, iteration=iteration, ids=ids)
+    scene = moving.scene()
+    fingerprint = np.frombuffer(bytes.fromhex(identity_of(scene).fingerprint), np.uint8)
+    np.savez(tmp_path / NAME, iteration=iteration, fingerprint=fingerprint, ids=ids)
     with pytest.raises(ValueError, match=r"objects\.npz .*: delete it"):
-        stored_objects(moving.scene(), tmp_path)
+        stored_objects(scene, tmp_path)
 
 
 def test_a_folder_that_cannot_be_written_is_said(tmp_path):

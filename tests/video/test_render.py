@@ -17,6 +17,7 @@ from tests.video.test_writer import frames_of
 from warpgs import rendering
 from warpgs.cli import main
 from warpgs.distortion import Distortion
+from warpgs.editing.objects import write_objects
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
 from warpgs.runs.trained import TrainedScene
@@ -216,7 +217,7 @@ def test_alpha_is_grey(run, capture, scene, tmp_path):
 
 def test_objects_are_those_of_the_run(run, capture, scene, tmp_path):
     ids = torch.arange(len(scene.scene.dynamic)) % 3
-    np.savez(run / "objects.npz", iteration=scene.metadata.iteration, ids=ids.int().numpy())
+    write_objects(scene, run, ids.int().numpy())
     render(run, tmp_path, layers="objects")
     objects = torch.cat([torch.zeros(len(scene.scene.static), dtype=torch.int64), ids])
     for name, image in images_in(tmp_path).items():

@@ -8,11 +8,10 @@ import pytest
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 pytest.importorskip("playwright.sync_api", reason="browser tests need playwright: pip install -e '.[browser]'")
 
-from tests import tiny
 from tests.viewer.test_browser import SIZE, browser  # noqa: F401  # a fixture
 from tests.viewer.watched import until
 from warpgs.editing.edits_file import NAME, read_edits
-from warpgs.editing.objects import NAME as OBJECTS
+from warpgs.editing.objects import write_objects
 from warpgs.editing.options import Editing, Edits
 from warpgs.runs.run import Run
 from warpgs.viewer.serve import training_cameras
@@ -24,8 +23,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connecti
 
 def test_what_is_clicked_is_removed_undone_and_saved(browser, run, tmp_path):  # noqa: F811
     copy = shutil.copytree(run, tmp_path / "run")
-    count = len(Run.open(copy, "cpu").trained_scene().scene.dynamic)
-    np.savez(copy / OBJECTS, iteration=tiny.LENGTH, ids=np.ones(count, np.int32))
+    scene = Run.open(copy, "cpu").trained_scene()
+    write_objects(scene, copy, np.ones(len(scene.scene.dynamic), np.int32))
     source = open_source(copy, "cpu", False)
     training = training_cameras(source, pytest.fail)
     source.edit(Editing(), training.capture)

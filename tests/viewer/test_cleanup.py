@@ -12,10 +12,10 @@ import torch
 
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
-from tests import tiny
 from tests.viewer.test_path_editor import Control
 from warpgs.editing.edits_file import NAME, read_edits
 from warpgs.editing.objects import NAME as OBJECTS
+from warpgs.editing.objects import write_objects
 from warpgs.editing.options import Editing, Edits
 from warpgs.runs.run import Run
 from warpgs.viewer.cleanup import Cleanup, box_edges
@@ -72,13 +72,13 @@ def opened(run, editing=None):
 
 
 def visited(source):
-    names = ("crop", "opacity", "floaters", "object", "choice", "undo", "save", "note")
+    names = ("crop", "opacity", "floaters", "find", "object", "choice", "undo", "save", "note")
     controls = SimpleNamespace(**{name: Control() for name in names})
     controls.corners = [Control((0.0, 0.0, 0.0)) for _ in range(2)]
     woken = []
-    panel = SimpleNamespace(cleanup=controls, current_time=0.25)
+    panel = SimpleNamespace(cleanup=controls, current_time=0.25, layer=Control(), current_layer="joint")
     made = Cleanup(Scene(), panel, source, threading.Lock(), lambda: woken.append(1))
-    made.controls, made.woken, made.browser, made.source = controls, woken, made._scene, source
+    made.controls, made.panel, made.woken, made.browser, made.source = controls, panel, woken, made._scene, source
     return made
 
 
@@ -214,9 +214,13 @@ def test_undo_does_not_return_to_edits_that_were_refused(cleanup, monkeypatch):
 @pytest.fixture
 def with_objects(run):
     """A browser of a run whose dynamic Gaussians are two objects."""
-    count = len(Run.open(run, "cpu").trained_scene().scene.dynamic)
-    np.savez(run / OBJECTS, iteration=tiny.LENGTH, ids=1 + np.arange(count, dtype=np.int32) % 2)
+    two_objects(run)
     return opened(run)
+
+
+def two_objects(run):
+    scene = Run.open(run, "cpu").trained_scene()
+    write_objects(scene, run, 1 + np.arange(len(scene.scene.dynamic), dtype=np.int32) % 2)
 
 
 def choose(cleanup, name, choice):
@@ -251,6 +255,40 @@ def test_an_object_is_frozen_at_the_current_time(with_objects):
 
 def test_the_layer_of_objects_needs_no_edits(with_objects):
     assert {*with_objects.scene().splats(0.5).objects.tolist()} == {0, 1, 2}
+
+
+def test_objects_are_found_when_they_are_first_asked_for_and_then_for_all_browsers(run, monkeypatch):
+    monkeypatch.setattr(
+        "warpgs.editing.objects.find_objects", lambda scene: np.ones(len(scene.scene.dynamic), np.int32)
+    )
+    cleanup = opened(run)
+    other = visited(cleanup.source)
+    assert not (run / OBJECTS).exists()
+    assert not cleanup.controls.object.visible
+    assert other.scene().splats(0.5).objects is None
+    cleanup.panel.current_layer = "objects"
+    cleanup.panel.layer.value = "objects"
+    assert (run / OBJECTS).exists()
+    for browser in (cleanup, other):
+        assert 1 in browser.scene().splats(0.5).objects
+        assert browser.controls.object.options == ("1",)
+        assert not browser.controls.find.visible
+    assert note(cleanup).startswith("objects: 1 (")
+
+
+def test_the_button_finds_objects(run):
+    cleanup = opened(run)
+    assert cleanup.controls.find.visible
+    cleanup.controls.find.click()
+    assert (run / OBJECTS).exists()
+    assert cleanup.scene().splats(0.5).objects is not None
+
+
+def test_objects_of_a_training_that_is_followed_are_not_found(run):
+    cleanup = visited(open_source(run, "cpu", True))
+    cleanup.controls.find.click()
+    assert not cleanup.controls.find.visible
+    assert not (run / OBJECTS).exists()
 
 
 def test_objects_that_there_are_not_cannot_be_chosen(with_objects):

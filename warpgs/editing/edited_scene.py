@@ -17,7 +17,7 @@ from .contribution import Contribution, contribution, sample_cameras, weakest
 from .edits_file import check, edits_in_use, save_edits
 from .object_scene import ObjectScene, number_of, with_boxes, with_objects
 from .objects import Objects, find_objects, stored_objects
-from .options import Box, Editing, Edits
+from .options import Box, Editing, Edits, split_names
 
 NUM_TIMES = 9
 """Number of times at which positions and opacities are looked at."""
@@ -58,7 +58,7 @@ def with_edits(
         ValueError: As ``edits_in_use``, ``stored_objects`` and ``edited``.
         OSError: If edits cannot be saved.
     """
-    edits = edits_in_use(folder, editing)
+    edits, original = edits_in_use(folder, editing, scene), scene
     before, notes = _number(scene), list[str]()
     if numbered or edits.about_objects:
         scene, notes = with_ids(scene, folder, edits)
@@ -67,7 +67,7 @@ def with_edits(
         scene = edited(scene, edits, capture, quiet)
         notes.append(f"edits keep {_number(scene):,} of {before:,} Gaussians")
     if editing.save_edits:
-        notes.append(f"edits saved as {save_edits(folder, editing, edits)}")
+        notes.append(f"edits saved as {save_edits(folder, editing, edits, original)}")
     return scene, notes
 
 
@@ -177,7 +177,7 @@ def _of_objects(scene: ObjectScene, objects: Objects, edits: Edits) -> Bool[Tens
     kept = torch.ones_like(scene.ids, dtype=torch.bool)
     for option, names, stays in (("objects", edits.objects, True), ("remove", edits.remove, False)):
         if names is not None:
-            numbers = [number_of(objects, option, name.strip()) for name in names.split(",")]
+            numbers = [number_of(objects, option, name) for name in split_names(names)]
             kept &= torch.isin(scene.ids, torch.tensor(numbers, device=scene.device)) == stays
     return kept
 

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from warpgs.files import MAX_NUMBER, read_json, read_numbers, write_json
+from warpgs.runs.trained import TrainedScene
 
-from .options import Editing, Edits
+from .identity import Identity, identity_of
+from .options import Editing, Edits, split_names
 
 NAME = "edits.json"
 """File in a run folder."""
@@ -28,28 +30,37 @@ NONE = Path("none")
 """Instead of a file: no edits but those that are given."""
 
 
-def edits_in_use(folder: Path, editing: Editing) -> Edits:
+def edits_in_use(folder: Path, editing: Editing, scene: TrainedScene) -> Edits:
     """The edits of a file, each replaced by the one that is given.
 
     Args:
         folder: Run folder.
         editing: The options.
+        scene: The scene that is edited, without edits.
 
     Raises:
-        ValueError: If an edit that is given or the file is not valid, or a file that is named is missing.
+        ValueError: If an edit that is given or the file is not valid or would change nothing, a file that is named is
+            missing, or it has numbers of objects of another scene.
     """
     check(editing.given)
     path = editing.edits or folder / NAME
     if path == NONE or (editing.edits is None and not path.exists()):
+        _check_effect(editing.given, editing.given)
         return editing.given
     given = {name: getattr(editing.given, name) for name in names_of(editing.given)}
-    edits = dataclasses.replace(read_edits(path), **given)
+    saved, identity = _read(path)
+    if dataclasses.replace(saved, **{name: getattr(Edits(), name) for name in given}).by_number:
+        _check_identity(path, identity, identity_of(scene))
+    edits = dataclasses.replace(saved, **given)
     check(edits)
+    _check_effect(editing.given, edits)
     return dataclasses.replace(edits, drop_floaters=edits.drop_floaters or None)
 
 
-def save_edits(folder: Path, editing: Editing, edits: Edits) -> Path:
+def save_edits(folder: Path, editing: Editing, edits: Edits, scene: TrainedScene) -> Path:
     """Writes edits to the file that the options name, or to the one of the run folder; returns its path.
+
+    The file says which scene it is for if it has numbers of objects.
 
     Raises:
         ValueError: If the options say that there is no file.
@@ -58,7 +69,9 @@ def save_edits(folder: Path, editing: Editing, edits: Edits) -> Path:
     if editing.edits == NONE:
         raise ValueError("--save-edits writes a file: --edits cannot be none")
     path = editing.edits or folder / NAME
-    values = {"format": "warpgs edits", "version": VERSION}
+    values: dict[str, Any] = {"format": "warpgs edits", "version": VERSION}
+    if edits.by_number:
+        values["checkpoint"] = identity_of(scene)._asdict()
     write_json(path, values | {name: getattr(edits, name) for name in names_of(edits)})
     return path
 
@@ -69,11 +82,17 @@ def read_edits(path: Path) -> Edits:
     Raises:
         ValueError: If it is missing, damaged or of another version, or has edits that are unknown or not valid.
     """
+    return _read(path)[0]
+
+
+def _read(path: Path) -> tuple[Edits, Identity | None]:
+    """The edits of a file and the scene that they are for; None if the file does not say it."""
     values = read_json(path, max_bytes=MAX_BYTES)
     if values.pop("format", None) != "warpgs edits":
         raise ValueError(f"{path} is not a file of edits of warpgs")
     if (version := values.pop("version", None)) != VERSION:
         raise ValueError(f"{path} has version {reprlib.repr(version)}, this program reads {VERSION}")
+    identity = _parsed_identity(path, values.pop("checkpoint", None))
     known = [field.name for field in dataclasses.fields(Edits)]
     if unknown := sorted(set(values) - set(known)):
         raise ValueError(f"{path} has an unknown edit {unknown[0][:60]!r}, expected some of {', '.join(known)}")
@@ -82,7 +101,42 @@ def read_edits(path: Path) -> Edits:
         check(Edits(**parsed))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    return Edits(**parsed)
+    return Edits(**parsed), identity
+
+
+def _parsed_identity(path: Path, values: Any) -> Identity | None:
+    if values is None:
+        return None
+    identity = Identity(**values) if isinstance(values, dict) and {*values} == {*Identity._fields} else None
+    if identity is None or type(identity.iteration) is not int or type(identity.fingerprint) is not str:
+        raise ValueError(f"{path}: checkpoint must have an iteration and a fingerprint, got {reprlib.repr(values)}")
+    return identity
+
+
+def _check_identity(path: Path, identity: Identity | None, now: Identity) -> None:
+    """Raises ValueError unless numbers in a file are of the scene of now."""
+    if identity == now:
+        return
+    if identity is None:
+        former = "does not say which checkpoint its numbers of objects are of"
+    elif identity.iteration != now.iteration:
+        former = f"has numbers of objects at iteration {identity.iteration:,}, but the run is at {now.iteration:,}"
+    else:
+        former = f"has numbers of objects of another training up to iteration {now.iteration:,}"
+    raise ValueError(f"{path} {former}: look them up again with --edits none --layers objects, and delete the file")
+
+
+def _check_effect(given: Edits, edits: Edits) -> None:
+    """Raises ValueError if an object that is given a change is removed by the edits in use."""
+    for option in ("recolor", "freeze", "shift"):
+        for name, *_ in getattr(given, option):
+            if name in split_names(edits.remove):
+                raise ValueError(f"--{option} {name} would change nothing, because --remove {edits.remove} removes it")
+            if edits.objects is not None and name not in split_names(edits.objects):
+                raise ValueError(
+                    f"--{option} {name} would change nothing, because --objects {edits.objects} removes it: "
+                    f"add {name} to --objects"
+                )
 
 
 def check(edits: Edits) -> None:

@@ -156,13 +156,13 @@ def with_boxes(ids: Int32[np.ndarray, " D"], scene: TrainedScene, boxes: Sequenc
             raise ValueError(f"--box {name} has no static Gaussians inside")
         of_static[inside.cpu()] = count + k
     names = (*(str(k) for k in range(1, count + 1)), *(name for name, *_ in boxes))
-    return Objects(np.concatenate([of_static.numpy(), ids]), names)
+    return Objects(np.concatenate([of_static.numpy(), ids]), names, len(ids))
 
 
 def number_of(objects: Objects, option: str, name: str) -> int:
     """The number of the object of a name, 0 for what belongs to none; raises ValueError if there is none."""
     if name not in ("0", *objects.names):
-        known = ", ".join(objects.names) or "none"
+        known = ", ".join(objects.names) or f"{objects}; --box makes one of static Gaussians"
         raise ValueError(f"--{option} {name}: there is no such object; the objects of this scene are: {known}")
     return 0 if name == "0" else objects.names.index(name) + 1
 

@@ -16,16 +16,20 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from warpgs.data.npz import read_npz
+from warpgs.data.npz import names_of, read_npz
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.files import write_bytes
 from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import evenly_spaced
 
 from .contribution import weakest
+from .identity import identity_of
 
 NAME = "objects.npz"
 """File in a run folder."""
+
+ARRAYS = ("iteration", "fingerprint", "ids")
+"""Arrays in it: the ``Identity`` of the scene, and the object of each dynamic Gaussian."""
 
 MAX_BYTES = 1 << 30
 """Maximum size of its arrays [bytes]."""
@@ -59,14 +63,17 @@ class Objects(NamedTuple):
     Attributes:
         ids: [N] number of its object, static Gaussians first; 0 if it belongs to none.
         names: Names of the objects 1, 2, …: of dynamic ones their numbers.
+        num_dynamic: Number of dynamic Gaussians.
     """
 
     ids: Int32[np.ndarray, " N"]
     names: tuple[str, ...]
+    num_dynamic: int
 
     def __str__(self) -> str:
         if not self.names:
-            return "none"
+            no_group = f"no group of the {self.num_dynamic:,} dynamic Gaussians stays together"
+            return f"none, because {no_group if self.num_dynamic else 'nothing in this scene is dynamic'}"
         counts = np.bincount(self.ids, minlength=len(self.names) + 1)[1:]
         listed = zip(range(1, len(counts) + 1), self.names, counts, strict=True)
         return ", ".join(
@@ -78,7 +85,7 @@ def stored_objects(scene: TrainedScene, folder: Path) -> tuple[Int32[np.ndarray,
     """The objects of a run, found once for its newest checkpoint and kept in its folder, so that all commands agree.
 
     Args:
-        scene: Of the newest checkpoint.
+        scene: Of the newest checkpoint, not edited.
         folder: Its run folder.
 
     Returns:
@@ -87,25 +94,40 @@ def stored_objects(scene: TrainedScene, folder: Path) -> tuple[Int32[np.ndarray,
     Raises:
         ValueError: If the file is damaged.
     """
-    path, iteration, count = folder / NAME, scene.metadata.iteration, len(scene.scene.dynamic)
-    if not count:
-        return np.zeros(0, np.int32), ""
-    if path.exists():
-        stored = read_npz(path, ("iteration", "ids"), MAX_BYTES)
-        ids = stored["ids"]
-        if stored["iteration"].shape != () or ids.ndim != 1 or ids.dtype != np.int32:
-            raise ValueError(f"{path} does not hold one number and whole numbers of 32 bits: delete it")
-        if stored["iteration"] == iteration and len(ids) == count:
-            if not 0 <= ids.min() <= ids.max() <= count:
-                raise ValueError(f"{path} has numbers of objects outside of 0 to {count:,}: delete it")
-            return ids, ""
-    ids, data = find_objects(scene), io.BytesIO()
-    np.savez_compressed(data, iteration=iteration, ids=ids)
-    try:
-        write_bytes(path, [data.getvalue()])
-    except OSError as error:
-        return ids, f"objects are found anew each time: {error}"
+    ids = known_objects(scene, folder)
+    if ids is None:
+        ids = find_objects(scene)
+        try:
+            write_objects(scene, folder, ids)
+        except OSError as error:
+            return ids, f"objects are found anew each time: {error}"
     return ids, ""
+
+
+def known_objects(scene: TrainedScene, folder: Path) -> Int32[np.ndarray, " D"] | None:
+    """The objects that were found before; None if they were not, or of other Gaussians. As ``stored_objects``."""
+    path, count = folder / NAME, len(scene.scene.dynamic)
+    if not count:
+        return np.zeros(0, np.int32)
+    if not path.exists() or not {*ARRAYS} <= names_of(path):
+        return None
+    stored = read_npz(path, ARRAYS, MAX_BYTES)
+    ids, fingerprint = stored["ids"], stored["fingerprint"]
+    if stored["iteration"].shape != () or ids.ndim != 1 or ids.dtype != np.int32 or fingerprint.dtype != np.uint8:
+        raise ValueError(f"{path} does not hold one number, bytes and whole numbers of 32 bits: delete it")
+    if (stored["iteration"], fingerprint.tobytes().hex()) != identity_of(scene) or len(ids) != count:
+        return None
+    if not 0 <= ids.min() <= ids.max() <= count:
+        raise ValueError(f"{path} has numbers of objects outside of 0 to {count:,}: delete it")
+    return ids
+
+
+def write_objects(scene: TrainedScene, folder: Path, ids: Int32[np.ndarray, " D"]) -> None:
+    """Keeps the objects of a scene; raises OSError if they cannot be written."""
+    iteration, fingerprint = identity_of(scene)
+    data, digest = io.BytesIO(), np.frombuffer(bytes.fromhex(fingerprint), np.uint8)
+    np.savez_compressed(data, **dict(zip(ARRAYS, (iteration, digest, ids), strict=True)))
+    write_bytes(folder / NAME, [data.getvalue()])
 
 
 def find_objects(scene: TrainedScene) -> Int32[np.ndarray, " D"]:

@@ -52,6 +52,18 @@ class Edits:
         named = self.objects is not None or self.remove is not None
         return named or any((self.box, self.recolor, self.freeze, self.shift))
 
+    @property
+    def by_number(self) -> bool:
+        """Whether they name dynamic objects by their numbers, which training changes."""
+        rows = (*self.recolor, *self.freeze, *self.shift)
+        names = [*(name for name, *_ in rows), *split_names(self.objects), *split_names(self.remove)]
+        return any(name.isdecimal() and name.strip("0") for name in names)
+
+
+def split_names(names: str | None) -> list[str]:
+    """The names of objects in a list of them; none without a list."""
+    return [] if names is None else [name.strip() for name in names.split(",")]
+
 
 @dataclass(frozen=True)
 class Editing:

@@ -67,15 +67,12 @@ class Cleanup:
         self._last = ""  # name of the edit that was changed last
         self._handles: list[Any] = []
         self._is_setting = False
-        self._shown: tuple[Edits, TrainedScene] | None = None
+        self._shown: tuple[Edits, TrainedScene, TrainedScene] | None = None  # edits, the scene without and with them
         shown = source.current()
         self._can_edit = not source.follow and shown is not None and not shown.varies
-        self._objects = source.object_names
-        if self._objects:
-            controls.object.options = self._objects
         for control in (controls.crop, controls.opacity, controls.floaters, controls.undo, controls.save):
             control.disabled = not self._can_edit
-        controls.object.visible = controls.choice.visible = bool(self._objects)
+        self._show_objects()
         self.edits = source.edits
         self._set_controls()
         controls.crop.on_update(lambda _: self._crop())
@@ -85,6 +82,8 @@ class Cleanup:
             lambda _: self._change("min_opacity", clamped(controls.opacity.value, OPACITIES) or None)
         )
         controls.floaters.on_update(lambda _: self._change("drop_floaters", bool(controls.floaters.value) or None))
+        controls.find.on_click(lambda _: self.find_objects())
+        panel.layer.on_update(lambda _: self.find_objects() if panel.current_layer == "objects" else None)
         controls.choice.on_click(lambda _: self._choose(controls.object.value, controls.choice.value))
         controls.undo.on_click(lambda _: self._undo())
         controls.save.on_click(lambda _: self._save())
@@ -94,14 +93,39 @@ class Cleanup:
         scene, edits = self._source.current(), self.edits
         if scene is None or not self._can_edit:
             return scene
-        if self._shown is None or self._shown[0] != edits:
+        shown = self._shown
+        if shown is None or shown[0] != edits or shown[1] is not scene:
+            if shown is None or shown[1] is not scene:  # another browser may have found objects
+                self._show_objects()
             try:
                 with self._rendering:
-                    self._shown = edits, self._source.edited(edits)
+                    shown = self._shown = edits, scene, self._source.edited(edits)
             except ValueError as error:
                 self._refuse(edits, one_line(error))
-                return scene if self._shown is None else self._shown[1]
-        return self._shown[1]
+                return scene if shown is None else shown[2]
+        return shown[2]
+
+    def find_objects(self) -> None:
+        """Finds objects, for all browsers, unless they are known."""
+        if not self._source.can_find_objects:
+            return
+        self._note("finding objects")
+        try:
+            with self._rendering:
+                notes = self._source.find_objects()
+            self._note("; ".join(notes))
+        except ValueError as error:
+            self._note(one_line(error))
+        self._wake()
+
+    def _show_objects(self) -> None:
+        """Offers the objects that were found, or to find them."""
+        controls = self._controls
+        self._objects = self._source.object_names
+        if self._objects:
+            controls.object.options = self._objects
+        controls.object.visible = controls.choice.visible = bool(self._objects)
+        controls.find.visible = self._source.can_find_objects
 
     def restore(self, edits: Edits) -> None:
         """Makes the edits of a page that was reloaded."""

@@ -28,6 +28,8 @@ class CleanupControls:
             self.opacity = gui.add_slider("min opacity", *OPACITIES, 0.01, 0.0, hint=hint)
             hint = "Removes isolated Gaussians that the training cameras see little of"
             self.floaters = gui.add_checkbox("drop floaters", False, hint=hint)
+            hint = "Parts that move together, which can take a minute; the layer objects finds them, too"
+            self.find = gui.add_button("Find objects", hint=hint)
             self.object = gui.add_dropdown("object", ("none",), hint="A number of the layer objects, or a box")
             self.choice = gui.add_button_group("action", (ONLY, REMOVE, FREEZE), hint="Freeze: at the current time")
             self.undo = gui.add_button("Undo", hint="The last edit")

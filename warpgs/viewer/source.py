@@ -10,6 +10,7 @@ from warpgs.data.capture import Capture
 from warpgs.editing.edited_scene import edited, with_edits, with_ids
 from warpgs.editing.edits_file import edits_in_use, save_edits
 from warpgs.editing.object_scene import ObjectScene, with_boxes
+from warpgs.editing.objects import known_objects
 from warpgs.editing.options import Editing, Edits
 from warpgs.errors import one_line
 from warpgs.runs import preview
@@ -45,7 +46,7 @@ class Source:
     def __init__(self, run: Run, follow: bool = False) -> None:
         self.run, self.follow = run, follow
         self.note = self.progress = ""
-        self._reading, self._asking = threading.Lock(), threading.Lock()
+        self._reading, self._asking, self._finding = (threading.Lock() for _ in range(3))
         self._loaded: tuple[Path, int] | None = None
         self._checked = -POLL_SECONDS
         self._scene: TrainedScene | None = None if follow else run.trained_scene()
@@ -57,11 +58,28 @@ class Source:
         """Begins with the edits of the options; returns lines about them. Raises as ``with_edits``."""
         assert self._scene is not None
         self._editing, self._capture = editing, capture
-        self._scene, notes = with_ids(self._scene, self.run.folder)
+        self.edits = edits_in_use(self.run.folder, editing, self._scene)
+        is_known = not self._scene.varies and known_objects(self._scene, self.run.folder) is not None
+        notes = self.find_objects() if is_known or self.edits.about_objects else []
         scene, more = with_edits(self._scene, self.run.folder, editing, lambda: capture)
-        self.edits = edits_in_use(self.run.folder, editing)
         self._edited[self.edits] = scene
-        return notes + more
+        return [*dict.fromkeys(notes + more)]
+
+    @property
+    def can_find_objects(self) -> bool:
+        """Whether objects can be found and were not yet: not of a training that is followed, nor of a sequence."""
+        scene = self._scene
+        return not (self.follow or scene is None or scene.varies or isinstance(scene, ObjectScene))
+
+    def find_objects(self) -> list[str]:
+        """Finds objects unless they are known; returns lines about them. Raises as ``with_ids``."""
+        with self._finding:
+            if not self.can_find_objects:
+                return []
+            assert self._scene is not None
+            self._scene, notes = with_ids(self._scene, self.run.folder, self.edits)
+            self._edited = {}
+            return notes
 
     def edited(self, edits: Edits) -> TrainedScene:
         """The scene with other edits, which is kept for all browsers; raises as ``edited_scene.edited``."""
@@ -73,7 +91,7 @@ class Source:
 
     @property
     def object_names(self) -> tuple[str, ...]:
-        """Names of the objects of the run, dynamic ones first, then those in boxes of the edits to begin with."""
+        """Names of the objects that were found, dynamic ones first, then those in boxes of the edits to begin with."""
         scene = self._scene
         if not isinstance(scene, ObjectScene):
             return ()
@@ -82,7 +100,8 @@ class Source:
     def save(self, edits: Edits) -> Path:
         """Writes edits to the file of edits; raises as ``save_edits``, and as ``edited`` if they cannot be made."""
         self.edited(edits)
-        return save_edits(self.run.folder, self._editing, edits)
+        assert self._scene is not None
+        return save_edits(self.run.folder, self._editing, edits, self._scene)
 
     @property
     def device(self) -> torch.device:
