@@ -1,8 +1,10 @@
 """The file of edits: read back as written, bounded, and used by all commands."""
 
+import base64
 import dataclasses
 import json
 import shutil
+import zlib
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from tests.data.captures import edit_json
 from tests.export.scenes import refusal, trained_scene
 from warpgs.cli import main
 from warpgs.editing.edits_file import MAX_BYTES, NAME, NONE, edits_in_use, read_edits, save_edits
+from warpgs.editing.marked import Marked
 from warpgs.editing.objects import write_objects
 from warpgs.editing.options import Editing, Edits
 from warpgs.files import write_json
@@ -30,11 +33,16 @@ ALL = Edits(
     shift=(("3", -0.5),),
     objects="1,2,table",
     remove="0",
+    erased=Marked.of(np.arange(60) % 3 == 0),
     crop=(-1.0, -2.0, 0.5, 1.0, 2.0, 3.25),
     min_opacity=0.05,
     drop_floaters=True,
     max_gaussians=7,
 )
+
+
+BOMB = base64.b64encode(zlib.compress(bytes(1 << 20))).decode()
+"""Bits that are far more than those of 9 Gaussians."""
 
 
 @pytest.fixture
@@ -119,6 +127,15 @@ def test_a_file_that_is_named_must_exist(tmp_path, scene):
         ({"checkpoint": 7}, "checkpoint must have an iteration and a fingerprint, got 7"),
         ({"checkpoint": {"iteration": 7}}, "checkpoint must have an iteration and a fingerprint"),
         ({"checkpoint": {"iteration": "7", "fingerprint": "a"}}, "checkpoint must have an iteration"),
+        ({"erased": [1]}, "erased must have a count and bits, got [1]"),
+        ({"erased": {"count": 9, "bits": 3}}, "erased must have a count and bits"),
+        ({"erased": {"count": 0, "bits": ""}}, "count of erased must be in [1, 268,435,456], got 0"),
+        ({"erased": {"count": True, "bits": ""}}, "count of erased must be in"),
+        ({"erased": {"count": 9, "bits": "?"}}, "bits of erased are damaged"),
+        ({"erased": {"count": 9, "bits": "AAAA"}}, "bits of erased are damaged"),
+        ({"erased": {"count": 9, "bits": BOMB}}, "bits of erased are not those of 9 Gaussians"),
+        ({"erased": {"count": 9, "bits": BOMB[:8]}}, "bits of erased are not those of 9 Gaussians"),
+        ({"erased": {"count": 7, "bits": Marked.of(np.ones(8, bool)).for_json()["bits"]}}, "are not those of 7"),
         ({"max_gaussians": -1}, "--max-gaussians must be at least 1"),
     ],
 )
@@ -145,8 +162,13 @@ def retrained(scene, iteration):
 @pytest.mark.parametrize(
     ("edits", "further", "reason"),
     [
-        (Edits(remove="0,2"), 5, "has numbers of objects at iteration {}, but the run is at {}"),
-        (Edits(freeze=(("1", 0.5),)), 0, "has numbers of objects of another training up to iteration {}"),
+        (Edits(remove="0,2"), 5, "has numbers of objects or Gaussians at iteration {}, but the run is at {}"),
+        (Edits(freeze=(("1", 0.5),)), 0, "has numbers of objects or Gaussians of another training up to iteration {}"),
+        (
+            Edits(erased=Marked.of(np.arange(60) < 9)),
+            0,
+            "has numbers of objects or Gaussians of another training up to iteration {}",
+        ),
     ],
 )
 def test_saved_numbers_of_objects_are_refused_for_other_gaussians(tmp_path, scene, edits, further, reason):
@@ -154,7 +176,7 @@ def test_saved_numbers_of_objects_are_refused_for_other_gaussians(tmp_path, scen
     assert edits_in_use(tmp_path, Editing(), scene) == edits
     refused = refused_use(tmp_path, Editing(), retrained(scene, iteration + further))
     assert refused.startswith(f"{path} {reason.format(iteration, iteration + further)}: ")
-    assert "--edits none --layers objects, and delete the file" in refused
+    assert "delete the file or give --edits none, and choose them anew" in refused
 
 
 def test_numbers_of_objects_without_their_checkpoint_are_refused(tmp_path, scene):

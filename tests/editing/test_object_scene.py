@@ -1,11 +1,13 @@
 """Edits of objects change the Gaussians of these objects at all times, and no others."""
 
+import numpy as np
 import pytest
 import torch
 
 from tests.editing import moving
 from tests.export import scenes
 from warpgs.editing.edited_scene import edited, with_edits, with_ids
+from warpgs.editing.marked import Marked
 from warpgs.editing.options import Editing, Edits
 from warpgs.model.gaussians import SH_C0
 
@@ -61,6 +63,25 @@ def test_objects_that_are_edited_can_be_cropped(scene):
     left = torch.cat([part[part[:, 0] >= -0.85] for part in means])
     assert 0 < len(left) < 300
     assert torch.equal(both.splats(0.6).means, left)
+
+
+def test_erased_gaussians_are_gone_and_objects_keep_their_numbers(scene):
+    mask = np.arange(390) % 3 == 0
+    mask[FIRST] = True  # all of object 1
+    part = edited(scene, Edits(erased=Marked.of(mask), freeze=(("2", 0.3),), min_opacity=0.0))
+    left = np.flatnonzero(~mask)
+    assert part.rows.tolist() == left.tolist()
+    assert {*part.splats(0.5).objects.tolist()} == {0, 2}
+    then = scene.splats(0.3).means
+    assert torch.equal(part.splats(0.8).means[-100:], then[left[-100:]])
+    cropped = edited(scene, Edits(erased=Marked.of(mask), crop=(-9.0, -9.0, -9.0, 0.0, 9.0, 9.0)))
+    assert torch.equal(cropped.splats(0.5).means, scene.splats(0.5).means[cropped.rows])
+    assert 0 < len(cropped.rows) < len(left)
+
+
+def test_erased_gaussians_of_another_scene_are_refused(scene):
+    with pytest.raises(ValueError, match="edits erase some of 9 Gaussians, but the scene has 390"):
+        edited(scene, Edits(erased=Marked.of(np.arange(9) > 3)))
 
 
 def brightness(sh):

@@ -192,6 +192,8 @@ def flags(options: type, prefix: str = "") -> Iterator[str]:
     """All options of a dataclass of options: ``--out``, ``--no-graph``, ``--model.depth`` …"""
     for name, hint in typing.get_type_hints(options, include_extras=True).items():
         shown, plain = _shown(name, hint), _plain(hint)
+        if _is_hidden(hint):
+            continue
         if dataclasses.is_dataclass(plain):
             yield from flags(typing.cast(type, plain), f"{prefix}{shown}." if shown else prefix)
             continue
@@ -222,6 +224,8 @@ def documented(options: type, prefix: str = "") -> Iterator[Option]:
     for field in dataclasses.fields(options):
         hint = hints[field.name]
         settings, shown, plain = _settings(hint), _shown(field.name, hint), _plain(hint)
+        if _is_hidden(hint):
+            continue
         if dataclasses.is_dataclass(plain):
             yield from documented(typing.cast(type, plain), f"{prefix}{shown}." if shown else prefix)
             continue
@@ -313,6 +317,11 @@ def _shown(name: str, hint: Any) -> str:
 def _is_open_switch(hint: Any) -> bool:
     """Whether an annotation is ``bool | None``: a switch that is neither on nor off unless given."""
     return bool(hint == (bool | None))
+
+
+def _is_hidden(hint: Any) -> bool:
+    """Whether a field is not an option, although its dataclass is of options."""
+    return tyro.conf.Suppress in getattr(hint, "__metadata__", ())
 
 
 def _plain(hint: Any) -> Any:

@@ -107,11 +107,13 @@ def edited(scene: TrainedScene, edits: Edits, capture: Capture | None = None, qu
     check(edits)
     if scene.varies and edits != NOTHING:
         raise ValueError("a sequence of files cannot be edited: edit its files one by one")
+    kept = _not_erased(scene, edits)
     if edits.about_objects:
         ids = scene.of_dynamic if isinstance(scene, ObjectScene) else find_objects(scene)
         objects = with_boxes(ids, scene, edits.box)
-        changed = with_objects(scene, objects, edits)
-        scene = _kept(changed, _of_objects(changed, objects, edits))
+        scene = changed = with_objects(scene, objects, edits)
+        kept &= _of_objects(changed, objects, edits)
+    scene = _kept(scene, kept)
     if edits.crop is not None or edits.min_opacity is not None:
         scene = _kept(scene, _inside_and_opaque(scene, edits))
     if not edits.drop_floaters and (edits.max_gaussians is None or _number(scene) <= edits.max_gaussians):
@@ -170,6 +172,16 @@ def _inside_and_opaque(scene: TrainedScene, edits: Edits) -> Bool[Tensor, " N"]:
         inside |= ((splats.means >= low) & (splats.means <= high)).all(1)
         opacities = opacities.maximum(splats.opacities)
     return inside & (opacities >= (edits.min_opacity or 0.0))
+
+
+def _not_erased(scene: TrainedScene, edits: Edits) -> Bool[Tensor, " N"]:
+    """Which Gaussians are not selected to be removed."""
+    kept = torch.ones(_number(scene), dtype=torch.bool, device=scene.device)
+    if edits.erased is not None:
+        if edits.erased.size != len(kept):
+            raise ValueError(f"edits erase some of {edits.erased.size:,} Gaussians, but the scene has {len(kept):,}")
+        kept &= ~torch.from_numpy(edits.erased.mask).to(scene.device)
+    return kept
 
 
 def _of_objects(scene: ObjectScene, objects: Objects, edits: Edits) -> Bool[Tensor, " N"]:

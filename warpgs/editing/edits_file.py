@@ -11,13 +11,14 @@ from warpgs.files import MAX_NUMBER, read_json, read_numbers, write_json
 from warpgs.runs.trained import TrainedScene
 
 from .identity import Identity, identity_of
+from .marked import parse_marked
 from .options import Editing, Edits, split_names
 
 NAME = "edits.json"
 """File in a run folder."""
 
 VERSION = 1
-MAX_BYTES = 1 << 16
+MAX_BYTES = 64 << 20
 """Maximum size of a file [bytes]."""
 
 ROWS = {"box": 6, "recolor": 3, "freeze": 1, "shift": 1}
@@ -40,7 +41,7 @@ def edits_in_use(folder: Path, editing: Editing, scene: TrainedScene) -> Edits:
 
     Raises:
         ValueError: If an edit that is given or the file is not valid or would change nothing, a file that is named is
-            missing, or it has numbers of objects of another scene.
+            missing, or it has numbers of objects or Gaussians of another scene.
     """
     check(editing.given)
     path = editing.edits or folder / NAME
@@ -60,7 +61,7 @@ def edits_in_use(folder: Path, editing: Editing, scene: TrainedScene) -> Edits:
 def save_edits(folder: Path, editing: Editing, edits: Edits, scene: TrainedScene) -> Path:
     """Writes edits to the file that the options name, or to the one of the run folder; returns its path.
 
-    The file says which scene it is for if it has numbers of objects.
+    The file says which scene it is for if it has numbers of objects or Gaussians.
 
     Raises:
         ValueError: If the options say that there is no file.
@@ -72,7 +73,10 @@ def save_edits(folder: Path, editing: Editing, edits: Edits, scene: TrainedScene
     values: dict[str, Any] = {"format": "warpgs edits", "version": VERSION}
     if edits.by_number:
         values["checkpoint"] = identity_of(scene)._asdict()
-    write_json(path, values | {name: getattr(edits, name) for name in names_of(edits)})
+    values |= {name: getattr(edits, name) for name in names_of(edits)}
+    if edits.erased is not None:
+        values["erased"] = edits.erased.for_json()
+    write_json(path, values)
     return path
 
 
@@ -118,12 +122,15 @@ def _check_identity(path: Path, identity: Identity | None, now: Identity) -> Non
     if identity == now:
         return
     if identity is None:
-        former = "does not say which checkpoint its numbers of objects are of"
+        former = "does not say which checkpoint its numbers of objects or Gaussians are of"
     elif identity.iteration != now.iteration:
-        former = f"has numbers of objects at iteration {identity.iteration:,}, but the run is at {now.iteration:,}"
+        former = (
+            f"has numbers of objects or Gaussians at iteration {identity.iteration:,}, "
+            f"but the run is at {now.iteration:,}"
+        )
     else:
-        former = f"has numbers of objects of another training up to iteration {now.iteration:,}"
-    raise ValueError(f"{path} {former}: look them up again with --edits none --layers objects, and delete the file")
+        former = f"has numbers of objects or Gaussians of another training up to iteration {now.iteration:,}"
+    raise ValueError(f"{path} {former}: delete the file or give --edits none, and choose them anew")
 
 
 def _check_effect(given: Edits, edits: Edits) -> None:
@@ -198,6 +205,8 @@ def _parsed(path: Path, name: str, values: dict[str, Any]) -> Any:
         return tuple(parsed)
     if name == "crop":
         return tuple(read_numbers(path, values, name, (6,)).tolist())
+    if name == "erased":
+        return parse_marked(path, name, values[name])
     if name == "min_opacity":
         return float(read_numbers(path, values, name, ()))
     kind, value = {"drop_floaters": bool, "max_gaussians": int}.get(name, str), values[name]

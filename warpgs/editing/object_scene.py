@@ -80,6 +80,7 @@ class ObjectScene(TrainedScene):
     ) -> None:
         num_static = len(scene.scene.static)
         super().__init__(scene.scene, scene.config, scene.metadata)
+        self.rows = scene.rows
         self.ids, self._plain, self._retimed, self._recolored = ids, scene, retimed, recolored
         rows = [(change, (ids[num_static:] == change.object).nonzero()[:, 0]) for change in retimed]
         if rows := [(change, of_object) for change, of_object in rows if len(of_object)]:

@@ -126,7 +126,7 @@ def write_objects(scene: TrainedScene, folder: Path, ids: Int32[np.ndarray, " D"
     """Keeps the objects of a scene; raises OSError if they cannot be written."""
     iteration, fingerprint = identity_of(scene)
     data, digest = io.BytesIO(), np.frombuffer(bytes.fromhex(fingerprint), np.uint8)
-    np.savez_compressed(data, **dict(zip(ARRAYS, (iteration, digest, ids), strict=True)))
+    np.savez_compressed(data, iteration=iteration, fingerprint=digest, ids=ids)
     write_bytes(folder / NAME, [data.getvalue()])
 
 

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import tyro
 
+from .marked import Marked
+
 Box = tuple[float, float, float, float, float, float]
 """Two opposite corners of a box along the axes of the scene: x, y, z and x, y, z [scene units]."""
 
@@ -36,6 +38,8 @@ class Edits:
     """Remove all but these objects, such as 2 or 0,1."""
     remove: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME")] = None
     """Remove these objects."""
+    erased: Annotated[Marked | None, tyro.conf.Fixed, tyro.conf.Suppress] = None
+    """Remove these Gaussians, which were selected in the viewer."""
     crop: Annotated[Box | None, tyro.conf.arg(metavar="X Y Z X Y Z")] = None
     """Remove the Gaussians whose centres are outside of a box at all times, given by two opposite corners in the
     coordinates of the scene."""
@@ -54,10 +58,10 @@ class Edits:
 
     @property
     def by_number(self) -> bool:
-        """Whether they name dynamic objects by their numbers, which training changes."""
-        rows = (*self.recolor, *self.freeze, *self.shift)
-        names = [*(name for name, *_ in rows), *split_names(self.objects), *split_names(self.remove)]
-        return any(name.isdecimal() and name.strip("0") for name in names)
+        """Whether they name dynamic objects or Gaussians by their numbers, which training changes."""
+        named = (name for rows in (self.recolor, self.freeze, self.shift) for name, *_ in rows)
+        names = [*map(str, named), *split_names(self.objects), *split_names(self.remove)]
+        return self.erased is not None or any(name.isdecimal() and name.strip("0") for name in names)
 
 
 def split_names(names: str | None) -> list[str]:

@@ -5,7 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from warpgs.cameras import Camera
@@ -52,6 +52,7 @@ class TrainedScene:
         metadata: Of the checkpoint: which networks are in use, and the degree of spherical harmonics.
 
     Attributes:
+        rows (Tensor | None): [N] the rows that its Gaussians have in the scene they were selected from; None in that.
         varies: Whether it has other Gaussians at other times, so that ``scene`` are not all.
         background (Tensor | None): [3] colour behind all Gaussians, on the scene's device; None is black.
     """
@@ -60,6 +61,7 @@ class TrainedScene:
 
     def __init__(self, scene: SplitScene, config: Plan, metadata: Metadata) -> None:
         self.scene, self.config, self.metadata = scene, config, metadata
+        self.rows: Int64[Tensor, " N"] | None = None
         self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS, repeatable=True)
         self._inputs: _Inputs | None = None
         color = background_color(config.background)
@@ -99,7 +101,9 @@ class TrainedScene:
     def select(self, kept: Bool[Tensor, " N"]) -> "TrainedScene":
         """A scene of copies of the Gaussians to keep, by their rows in ``splats``."""
         num_static = len(self.scene.static)
-        return TrainedScene(self.scene.select(kept[:num_static], kept[num_static:]), self.config, self.metadata)
+        part = TrainedScene(self.scene.select(kept[:num_static], kept[num_static:]), self.config, self.metadata)
+        part.rows = kept.nonzero()[:, 0] if self.rows is None else self.rows[kept]
+        return part
 
     @torch.no_grad()
     def splats(self, time: float, residual: bool = True) -> Splats:
