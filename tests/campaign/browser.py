@@ -71,6 +71,12 @@ class Browser:
         self._receive(lambda: label in self._controls)
         self._send("GuiUpdateMessage", uuid=self._controls[label], updates={"value": value})
 
+    def point(self, kind: str, *positions: tuple[float, float], modifier: str | None = None) -> None:
+        """Clicks ("click") at a position on the screen, or drags a rectangle ("rect-select") between two."""
+        ray = (0.0, 0.0, 1.0) if kind == "click" else None
+        fields = {"ray_origin": ray, "ray_direction": ray, "screen_pos": positions, "modifier": modifier}
+        self._send("ScenePointerMessage", event_type=kind, **fields)
+
     def look(self) -> None:
         """Waits for another image."""
         seen = self.images

@@ -4,6 +4,7 @@ import html
 import re
 import shutil
 import threading
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,16 +14,38 @@ import torch
 pytest.importorskip("viser", reason="the viewer needs viser: pip install -e '.[viewer]'")
 
 from tests.viewer.test_path_editor import Control
+from tests.viewer.watched import advance
 from warpgs.editing.edits_file import NAME, read_edits
+from warpgs.editing.marked import Marked
 from warpgs.editing.objects import NAME as OBJECTS
 from warpgs.editing.objects import write_objects
 from warpgs.editing.options import Editing, Edits
 from warpgs.runs.run import Run
 from warpgs.viewer.cleanup import Cleanup, box_edges
-from warpgs.viewer.cleanup_controls import FREEZE, ONLY, REMOVE
+from warpgs.viewer.cleanup_controls import (
+    BRUSH,
+    CLEAR,
+    DELETE,
+    FREEZE,
+    INVERT,
+    LASSO,
+    OFF,
+    ONLY,
+    RECOLOR,
+    RECTANGLE,
+    REMOVE,
+    RESET,
+    SHIFT,
+)
+from warpgs.viewer.marks import LINE, NO_MARKS, Marks
+from warpgs.viewer.pose import Pose
+from warpgs.viewer.renderer import Renderer, RenderRequest
 from warpgs.viewer.source import MAX_EDITED, open_source
 
 pytestmark = pytest.mark.usefixtures("contracts_off", "quickly")
+
+
+CANVAS = (320, 240)
 
 
 class Corner:
@@ -46,7 +69,7 @@ class Scene:
     """The scene of a browser, with the corners and the edges of the box."""
 
     def __init__(self):
-        self.shown = {}
+        self.shown, self.heard = {}, {}
 
     def add_transform_controls(self, name, *_, **__):
         self.shown[name] = Corner()
@@ -54,6 +77,17 @@ class Scene:
 
     def add_line_segments(self, name, points, *_, **__):
         self.shown[name] = points
+
+    def on_click(self, modifier):
+        return partial(self.heard.__setitem__, ("click", modifier))
+
+    def on_rect_select(self, modifier):
+        return partial(self.heard.__setitem__, ("rect-select", modifier))
+
+    def remove_click_callback(self):
+        self.heard.clear()
+
+    remove_rect_select_callback = remove_click_callback
 
     def remove_by_name(self, name):
         self.shown = {other: value for other, value in self.shown.items() if not other.startswith(name)}
@@ -72,14 +106,34 @@ def opened(run, editing=None):
 
 
 def visited(source):
-    names = ("crop", "opacity", "floaters", "find", "object", "choice", "undo", "save", "note")
+    names = (
+        "crop",
+        "opacity",
+        "floaters",
+        "find",
+        "object",
+        "choice",
+        "change",
+        "color",
+        "shift",
+        "undo",
+        "save",
+        "note",
+    )
+    names += ("tool", "radius", "seen", "selected", "name", "copy")
     controls = SimpleNamespace(**{name: Control() for name in names})
     controls.corners = [Control((0.0, 0.0, 0.0)) for _ in range(2)]
     woken = []
     panel = SimpleNamespace(cleanup=controls, current_time=0.25, layer=Control(), current_layer="joint")
-    made = Cleanup(Scene(), panel, source, threading.Lock(), lambda: woken.append(1))
+    made = Cleanup(Scene(), panel, source, threading.Lock(), lambda: woken.append(1), lambda: asked(made, panel))
     made.controls, made.panel, made.woken, made.browser, made.source = controls, panel, woken, made._scene, source
     return made
+
+
+def asked(cleanup, panel):
+    """The image that a browser of 320 by 240 pixels asks for, which shows the whole scene."""
+    pose = Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -6.0), 1.0)
+    return RenderRequest(cleanup.scene(), pose, CANVAS, 320, panel.current_layer, True, panel.current_time)
 
 
 @pytest.fixture
@@ -251,6 +305,240 @@ def test_an_object_is_frozen_at_the_current_time(with_objects):
     assert with_objects.edits == Edits(freeze=(("2", 0.25), ("1", 0.25)))
     early, late = (with_objects.scene().splats(time).means for time in (0.0, 1.0))
     assert torch.equal(early, late)
+
+
+def change(cleanup, name, what):
+    cleanup.controls.object.value = name
+    cleanup.controls.change.value = what
+    cleanup.controls.change.click()
+
+
+def test_an_object_is_recoloured_shifted_and_reset(with_objects):
+    with_objects.controls.color.value, with_objects.controls.shift.value = (255, 51, 0), 0.25
+    change(with_objects, "1", RECOLOR)
+    choose(with_objects, "1", FREEZE)
+    change(with_objects, "1", SHIFT)
+    choose(with_objects, "2", REMOVE)
+    assert with_objects.edits == Edits(recolor=(("1", 1.0, 0.2, 0.0),), shift=(("1", 0.25),), remove="2")
+    choose(with_objects, "1", FREEZE)
+    assert with_objects.edits.shift == ()
+    change(with_objects, "1", RESET)
+    assert with_objects.edits == Edits(remove="2")
+    change(with_objects, "2", RESET)
+    assert with_objects.edits == Edits()
+
+
+@pytest.mark.parametrize("sent", [(1e9, -5, np.nan), (300, 0, -1)])
+def test_colours_and_times_that_a_browser_sends_are_clamped(with_objects, sent):
+    with_objects.controls.color.value, with_objects.controls.shift.value = sent, 99.0
+    change(with_objects, "1", RECOLOR)
+    change(with_objects, "1", SHIFT)
+    assert with_objects.edits == Edits(recolor=(("1", 1.0, 0.0, 0.0),), shift=(("1", 1.0),))
+
+
+def drag(cleanup, low, high, modifier=None):
+    """Draws a rectangle."""
+    cleanup.controls.tool.value = RECTANGLE
+    event = SimpleNamespace(screen_min=low, screen_max=high, modifier=modifier)
+    cleanup.browser.heard["rect-select", modifier](event)
+
+
+def click(cleanup, *points, modifier=None):
+    for point in points:
+        cleanup.browser.heard["click", modifier](SimpleNamespace(screen_pos=point, modifier=modifier))
+
+
+def placed(cleanup):
+    """[N, 2] positions on the screen of all Gaussians that are shown, in [0, 1]."""
+    request = asked(cleanup, cleanup.panel)
+    seen = request.seen
+    means = request.scene.splats(request.time).means
+    positions, *_ = seen.place(means @ seen.viewmat[:3, :3].T + seen.viewmat[:3, 3])
+    return positions.numpy() / CANVAS
+
+
+def selected(cleanup):
+    return cleanup.selection.selected.mask
+
+
+def test_a_rectangle_selects_the_centres_inside(cleanup):
+    drag(cleanup, (0.25, 0.25), (0.5, 0.75))
+    at = placed(cleanup)
+    near = np.abs(at - [[0.5, 0.75]]).min(1) < 0.02
+    near |= np.abs(at - 0.25).min(1) < 0.02
+    expected = ((at > [0.25, 0.25]) & (at < [0.5, 0.75])).all(1)
+    assert np.array_equal(selected(cleanup)[~near], expected[~near])
+    assert 5 < expected.sum() < len(expected) - 5
+    assert note(cleanup) == f"{selected(cleanup).sum():,} of {len(at):,} Gaussians are selected"
+
+
+def test_control_removes_from_the_selection_and_others_add_to_it(cleanup):
+    drag(cleanup, (0.0, 0.0), (0.5, 1.0))
+    left = selected(cleanup)
+    drag(cleanup, (0.5, 0.0), (1.0, 1.0))
+    whole = selected(cleanup)
+    assert left.sum() < whole.sum()
+    drag(cleanup, (0.5, 0.0), (1.0, 1.0), "cmd/ctrl")
+    assert not (selected(cleanup) & ~left).any()
+    drag(cleanup, (0.0, 0.0), (1.0, 1.0), "cmd/ctrl")
+    assert cleanup.selection.selected is None
+
+
+def test_a_lasso_is_closed_at_its_first_corner(cleanup):
+    cleanup.controls.tool.value = LASSO
+    corners = (0.0, 0.0), (1.0, 0.0), (0.0, 1.0)
+    click(cleanup, *corners)
+    assert cleanup.selection.marks.outline == corners
+    assert cleanup.selection.selected is None
+    click(cleanup, (0.01, 0.01))
+    assert cleanup.selection.marks.outline == ()
+    total = placed(cleanup).sum(1)
+    assert selected(cleanup)[total < 0.98].all()
+    assert not selected(cleanup)[total > 1.02].any()
+    assert 5 < selected(cleanup).sum() < len(total) - 5
+
+
+def test_a_brush_selects_around_a_click(cleanup):
+    cleanup.controls.radius.value = 40.0
+    cleanup.controls.tool.value = BRUSH
+    click(cleanup, (0.5, 0.5))
+    distances = np.linalg.norm((placed(cleanup) - 0.5) * CANVAS, axis=1)
+    assert selected(cleanup)[distances < 38].all()
+    assert not selected(cleanup)[distances > 42].any()
+    assert 0 < selected(cleanup).sum() < len(distances)
+
+
+def test_dynamic_gaussians_are_selected_where_they_are_shown(cleanup):
+    for time in (0.0, 1.0):
+        cleanup.panel.current_time = time
+        cleanup.selection.clear()
+        drag(cleanup, (0.0, 0.0), (0.5, 1.0))
+        left = placed(cleanup)[:, 0]
+        sure = np.abs(left - 0.5) > 0.01
+        assert np.array_equal(selected(cleanup)[sure], left[sure] < 0.5)
+
+
+def test_a_layer_selects_only_what_it_shows(cleanup):
+    cleanup.panel.current_layer = "dynamic"
+    drag(cleanup, (0.0, 0.0), (1.0, 1.0))
+    static = len(cleanup.source.current().scene.static)
+    assert not selected(cleanup)[:static].any()
+    assert selected(cleanup)[static:].all()
+
+
+def test_what_is_hidden_can_be_left_out(cleanup, monkeypatch):
+    size = len(placed(cleanup))
+    weights = torch.arange(size) % 2
+    monkeypatch.setattr("warpgs.viewer.selection.blend_weights_in", lambda *_: weights.float())
+    cleanup.controls.seen.value = True
+    drag(cleanup, (0.0, 0.0), (1.0, 1.0))
+    assert np.array_equal(selected(cleanup), weights.numpy() == 1)
+
+
+def test_what_is_selected_is_inverted_cleared_deleted_and_undone(cleanup):
+    whole, woken = count(cleanup), len(cleanup.woken)
+    drag(cleanup, (0.0, 0.0), (0.5, 1.0))
+    left = selected(cleanup)
+    use(cleanup, INVERT)
+    assert np.array_equal(selected(cleanup), ~left)
+    use(cleanup, CLEAR)
+    assert cleanup.selection.selected is None
+    drag(cleanup, (0.0, 0.0), (0.5, 1.0))
+    use(cleanup, DELETE)
+    assert cleanup.edits == Edits(erased=Marked.of(left))
+    assert cleanup.selection.selected is None
+    assert count(cleanup) == whole - left.sum()
+    drag(cleanup, (0.5, 0.0), (1.0, 0.5))  # rows of the scene without edits, also after some are gone
+    more = selected(cleanup)
+    assert not (more & left).any()
+    use(cleanup, DELETE)
+    assert count(cleanup) == whole - (left | more).sum()
+    cleanup.controls.undo.click()
+    cleanup.controls.undo.click()
+    assert count(cleanup) == whole
+    assert len(cleanup.woken) > woken
+
+
+def use(cleanup, choice):
+    cleanup.controls.selected.value = choice
+    cleanup.controls.selected.click()
+
+
+def test_inverting_leaves_out_what_is_gone(cleanup):
+    drag(cleanup, (0.0, 0.0), (0.5, 1.0))
+    left = selected(cleanup)
+    use(cleanup, DELETE)
+    use(cleanup, INVERT)
+    assert np.array_equal(selected(cleanup), ~left)
+
+
+def test_without_a_tool_clicks_are_not_heard(cleanup):
+    cleanup.controls.tool.value = LASSO
+    click(cleanup, (0.5, 0.5))
+    cleanup.controls.tool.value = OFF
+    assert cleanup.browser.heard == {}
+    assert cleanup.selection.marks.outline == ()
+
+
+@pytest.mark.parametrize("position", [(np.nan, 0.5), (0.5, np.inf)])
+def test_positions_that_no_screen_has_are_ignored(cleanup, position):
+    cleanup.controls.tool.value = LASSO
+    click(cleanup, position)
+    drag(cleanup, position, (1.0, 1.0))
+    assert cleanup.selection.marks == NO_MARKS
+
+
+def test_what_is_selected_is_tinted_in_the_image(cleanup):
+    drag(cleanup, (0.0, 0.0), (0.5, 1.0))
+    plain = asked(cleanup, cleanup.panel)
+    marked = plain._replace(marks=cleanup.selection.marks)
+    renderer = Renderer(threading.Lock())
+    before, after = (renderer.render(request, 1.0).image.astype(int) for request in (plain, marked))
+    changed = np.abs(after - before).sum(2)
+    assert changed[:, :160].sum() > 2 * changed[:, 160:].sum()
+    outline = renderer.render(plain._replace(marks=Marks(None, ((0.25, 0.5), (0.75, 0.5)))), 1.0).image
+    assert np.abs(outline[120, 80] - np.array(LINE)).max() < 3
+
+
+def test_deleted_gaussians_are_gone_in_all_commands(cleanup, run):
+    drag(cleanup, (0.0, 0.0), (0.5, 1.0))
+    left = selected(cleanup)
+    use(cleanup, DELETE)
+    cleanup.controls.save.click()
+    assert read_edits(run / NAME) == cleanup.edits
+    later, whole = opened(run), Run.open(run, "cpu").trained_scene()
+    assert torch.equal(later.scene().splats(0.3).means, whole.splats(0.3).means[~torch.from_numpy(left)])
+
+
+def test_a_new_run_has_the_checkpoint_and_the_edits(cleanup, run):
+    drag(cleanup, (0.0, 0.0), (0.5, 1.0))
+    use(cleanup, DELETE)
+    cleanup.controls.name.value = "cleaned"
+    cleanup.controls.copy.click()
+    assert note(cleanup) == "saved as cleaned, beside this run"
+    copy = run.parent / "cleaned"
+    assert not (run / NAME).exists()
+    assert count(opened(copy)) == count(cleanup)
+    assert torch.equal(Run.open(copy, "cpu").trained_scene().splats(0.3).means, cleanup.whole.splats(0.3).means)
+    cleanup.controls.copy.click()
+    assert "exists already: choose another name" in note(cleanup)
+
+
+@pytest.mark.parametrize("name", ["", "../other", ".hidden", "a/b"])
+def test_a_new_run_needs_a_name_of_a_folder(cleanup, run, name):
+    before = sorted(run.parent.iterdir())
+    cleanup.controls.name.value = name
+    cleanup.controls.copy.click()
+    assert "the name of a run must have" in note(cleanup)
+    assert sorted(run.parent.iterdir()) == before
+
+
+def test_a_run_that_was_trained_further_is_not_copied(cleanup, run):
+    advance(run)
+    cleanup.controls.name.value = "later"
+    cleanup.controls.copy.click()
+    assert "open it again" in note(cleanup)
+    assert not (run.parent / "later").exists()
 
 
 def test_the_layer_of_objects_needs_no_edits(with_objects):

@@ -118,6 +118,36 @@ def test_images_are_rendered_by_threads_that_end_with_their_browsers(run, monkey
 
 
 @pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
+def test_gaussians_are_deleted_by_a_rectangle_and_a_lasso_on_the_screen(run):
+    with (
+        Viewer(open_source(run, "cpu", False), None, "127.0.0.1", 0) as viewer,
+        Browser(viewer.port, random.Random(0)) as browser,
+    ):
+        browser.look()
+        until(lambda: viewer.sessions)
+        (session,) = viewer.sessions.values()
+        cleanup = session.cleanup
+        browser.set("select", "rectangle")
+        until(lambda: cleanup._controls.tool.value == "rectangle")
+        until(lambda: session._client.scene._scene_pointer_cb)
+        browser.point("rect-select", (0.0, 0.0), (0.6, 1.0))
+        until(lambda: cleanup.selection.selected)
+        first = cleanup.selection.selected
+        until(lambda: session._shown.request.marks.selected == first)
+        browser.set("selected", "Delete")
+        until(lambda: cleanup.edits.erased == first)
+        browser.set("select", "lasso")
+        until(lambda: any(entry.event_type == "click" for entry in session._client.scene._scene_pointer_cb))
+        for k, corner in enumerate([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (0.0, 0.0)], 1):
+            browser.point("click", corner)
+            until(lambda k=k: len(cleanup.selection.marks.outline) == k % 5)
+        until(lambda: cleanup.selection.selected)
+        assert not (cleanup.selection.selected.mask & first.mask).any()
+        browser.set("Undo", True)
+        until(lambda: cleanup.edits.erased is None)
+
+
+@pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
 def test_nothing_is_left_of_a_browser_when_the_next_one_has_left(run):
     """Python by itself finds what viser's handles refer to so late that memory grows over a hundred visits."""
     gc.collect()

@@ -20,6 +20,7 @@ from warpgs.viewer.browser_camera import through_training_camera
 from warpgs.viewer.canvas import MAX_ASPECT, MAX_CANVAS
 from warpgs.viewer.clock import Clock
 from warpgs.viewer.layers import LAYERS
+from warpgs.viewer.marks import NO_MARKS
 from warpgs.viewer.panel import Panel
 from warpgs.viewer.pose import Pose
 from warpgs.viewer.session import Session
@@ -161,7 +162,10 @@ def looking(pose, time, wipe=0.0):
     """A session that looks with a pose at a time, with the second training camera selected; it renders nothing."""
     here = session(view=2, width=640, layer="joint", residual=True, time=time, wipe=wipe)
     here._pose, here._training, here._clock, here._resolution = lambda: pose, TRAINING, Clock(), AdaptiveResolution()
-    here._source, here.cleanup = SimpleNamespace(), SimpleNamespace(scene=object)
+    here._source, here.cleanup = (
+        SimpleNamespace(),
+        SimpleNamespace(scene=object, selection=SimpleNamespace(marks=NO_MARKS)),
+    )
     here._frustums = SimpleNamespace(visible=True)
     here._requested = here._shown = None
     here._changed_at = 0.0

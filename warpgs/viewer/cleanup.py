@@ -10,13 +10,29 @@ import viser
 from jaxtyping import Float32
 
 from warpgs.editing.edits_file import check, names_of
-from warpgs.editing.options import Box, Edits
+from warpgs.editing.marked import Marked
+from warpgs.editing.options import Box, Edits, split_names
 from warpgs.errors import one_line
 from warpgs.runs.trained import TrainedScene
 
-from .cleanup_controls import CORNERS, FREEZE, ONLY, OPACITIES, REMOVE
+from .cleanup_controls import (
+    CLEAR,
+    CORNERS,
+    DELETE,
+    FREEZE,
+    INVERT,
+    ONLY,
+    OPACITIES,
+    RECOLOR,
+    REMOVE,
+    RESET,
+    SHIFT,
+    SHIFTS,
+)
 from .panel import Panel, clamped, set_value
 from .path_controls import note_html
+from .renderer import RenderRequest
+from .selection import Selection
 from .source import Source
 
 BOX = "/crop"
@@ -47,9 +63,11 @@ class Cleanup:
         source: The scene that is edited, and its edits so far.
         rendering: Lock of ``Renderer``, held while contributions are measured.
         wake: Called after a change.
+        request: The image that the browser asks for.
 
     Attributes:
         edits: The edits in use.
+        selection: What is selected to be deleted.
     """
 
     def __init__(
@@ -59,6 +77,7 @@ class Cleanup:
         source: Source,
         rendering: threading.Lock,
         wake: Callable[[], None],
+        request: Callable[[], RenderRequest | None],
     ) -> None:
         controls = panel.cleanup
         self._scene, self._panel, self._controls, self._source = scene, panel, controls, source
@@ -70,11 +89,24 @@ class Cleanup:
         self._shown: tuple[Edits, TrainedScene, TrainedScene] | None = None  # edits, the scene without and with them
         shown = source.current()
         self._can_edit = not source.follow and shown is not None and not shown.varies
-        for control in (controls.crop, controls.opacity, controls.floaters, controls.undo, controls.save):
+        for control in (
+            controls.crop,
+            controls.opacity,
+            controls.floaters,
+            controls.tool,
+            controls.undo,
+            controls.save,
+        ):
             control.disabled = not self._can_edit
+        controls.copy.disabled = not (self._can_edit and source.can_copy)
+        self.selection = Selection(scene, panel, self, request, rendering)
         self._show_objects()
         self.edits = source.edits
         self._set_controls()
+        self._connect()
+
+    def _connect(self) -> None:
+        controls, panel = self._controls, self._panel
         controls.crop.on_update(lambda _: self._crop())
         for corner in controls.corners:
             corner.on_update(lambda _: self._type())
@@ -85,8 +117,21 @@ class Cleanup:
         controls.find.on_click(lambda _: self.find_objects())
         panel.layer.on_update(lambda _: self.find_objects() if panel.current_layer == "objects" else None)
         controls.choice.on_click(lambda _: self._choose(controls.object.value, controls.choice.value))
+        controls.change.on_click(lambda _: self._choose(controls.object.value, controls.change.value))
+        controls.selected.on_click(lambda _: self._use_selection(controls.selected.value))
+        controls.copy.on_click(lambda _: self._copy())
         controls.undo.on_click(lambda _: self._undo())
         controls.save.on_click(lambda _: self._save())
+
+    @property
+    def whole(self) -> TrainedScene | None:
+        """The scene without edits; None before the first checkpoint of a training."""
+        return self._source.current()
+
+    def say(self, text: str) -> None:
+        """Shows a line about what was selected."""
+        self._note(text)
+        self._wake()
 
     def scene(self) -> TrainedScene | None:
         """The scene to show; None before the first checkpoint of a training. Edits that leave nothing are undone."""
@@ -124,7 +169,8 @@ class Cleanup:
         self._objects = self._source.object_names
         if self._objects:
             controls.object.options = self._objects
-        controls.object.visible = controls.choice.visible = bool(self._objects)
+        for control in (controls.object, controls.choice, controls.change, controls.color, controls.shift):
+            control.visible = bool(self._objects)
         controls.find.visible = self._source.can_find_objects
 
     def restore(self, edits: Edits) -> None:
@@ -133,12 +179,12 @@ class Cleanup:
             self.edits = edits
             self._set_controls()
 
-    def _change(self, name: str, value: Any) -> None:
-        """Replaces an edit; changes of one slider are one step of undo."""
+    def _change(self, name: str, value: Any, **others: Any) -> None:
+        """Replaces edits; changes of one slider are one step of undo."""
         with self._lock:
-            if self._is_setting or not self._can_edit or getattr(self.edits, name) == value:
+            changed = replace(self.edits, **{name: value}, **others)
+            if self._is_setting or not self._can_edit or changed == self.edits:
                 return
-            changed = replace(self.edits, **{name: value})
             try:
                 check(changed)
             except ValueError as error:  # a browser may send anything
@@ -152,16 +198,39 @@ class Cleanup:
         self._wake()
 
     def _choose(self, name: str, choice: str) -> None:
-        """Shows an object alone, removes it, or freezes it at the current time."""
+        """Shows an object alone, removes or changes it, or shows it as it was trained."""
         if name not in self._objects:
             return
+        edits, controls = self.edits, self._controls
+        recolored, frozen, shifted = (
+            tuple(row for row in rows if row[0] != name) for rows in (edits.recolor, edits.freeze, edits.shift)
+        )
         if choice == ONLY:
             self._change("objects", name)
         elif choice == REMOVE:
             self._change("remove", name if self.edits.remove is None else f"{self.edits.remove},{name}")
         elif choice == FREEZE:
-            others = tuple(row for row in self.edits.freeze if row[0] != name)
-            self._change("freeze", (*others, (name, self._panel.current_time)))
+            self._change("freeze", (*frozen, (name, self._panel.current_time)), shift=shifted)
+        elif choice == SHIFT:
+            self._change("shift", (*shifted, (name, clamped(controls.shift.value, SHIFTS))), freeze=frozen)
+        elif choice == RECOLOR:
+            red, green, blue = (clamped(value, (0, 255)) / 255 for value in controls.color.value)
+            self._change("recolor", (*recolored, (name, red, green, blue)))
+        elif choice == RESET:
+            removed = [other for other in split_names(edits.remove) if other != name]
+            self._change("recolor", recolored, freeze=frozen, shift=shifted, remove=",".join(removed) or None)
+
+    def _use_selection(self, choice: str) -> None:
+        """Deletes what is selected, selects the rest instead, or nothing."""
+        selection = self.selection
+        if choice == DELETE and selection.selected is not None:
+            erased, before = selection.selected.mask, self.edits.erased
+            self._change("erased", Marked.of(erased if before is None else erased | before.mask))
+        if choice == INVERT:
+            selection.invert()
+        elif choice in (DELETE, CLEAR):
+            selection.clear()
+        self._wake()
 
     def _undo(self) -> None:
         with self._lock:
@@ -186,6 +255,15 @@ class Cleanup:
             with self._rendering:
                 path = self._source.save(self.edits)
             self._note(f"saved as {path.name}")
+        except (ValueError, OSError) as error:
+            self._note(one_line(error))
+
+    def _copy(self) -> None:
+        """Saves the edits in a copy of the run."""
+        try:
+            with self._rendering:
+                folder = self._source.copy(str(self._controls.name.value), self.edits)
+            self._note(f"saved as {folder.name}, beside this run")
         except (ValueError, OSError) as error:
             self._note(one_line(error))
 

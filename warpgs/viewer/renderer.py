@@ -10,6 +10,7 @@ from warpgs.runs.trained import TrainedScene
 from warpgs.visualize.images import to_bytes
 
 from .layers import Image, render_layer
+from .marks import NO_MARKS, Marks, rows_of, tinted, with_outline
 from .pose import Pose, camera_of
 
 
@@ -25,6 +26,7 @@ class RenderRequest(NamedTuple):
         residual: Whether the appearance network changes the static Gaussians.
         time: Time in [0, 1].
         truth: Index of the training camera whose image is shown beside, and the part of its width; None without.
+        marks: What is selected.
     """
 
     scene: TrainedScene
@@ -35,6 +37,7 @@ class RenderRequest(NamedTuple):
     residual: bool
     time: float
     truth: tuple[int, float] | None = None
+    marks: Marks = NO_MARKS
 
     @property
     def size(self) -> tuple[int, int]:
@@ -42,6 +45,11 @@ class RenderRequest(NamedTuple):
         width, height = self.canvas
         across = min(width, self.max_width)
         return across, max(1, round(height * across / width))
+
+    @property
+    def seen(self) -> Camera:
+        """The camera of the browser, with the size of the canvas."""
+        return camera_of(self.pose, self.canvas, self.time)
 
     def size_at(self, scale: float) -> tuple[int, int]:
         """(width, height) of the image at a scale of its sides."""
@@ -80,16 +88,26 @@ class Renderer:
         Full-resolution images of the joint layer are replayed from a CUDA graph on CUDA, which is faster.
         """
         size, scene = request.size_at(scale), request.scene
-        replays = scale == 1 and request.layer == "joint" and request.residual and scene.uses_graphs
+        replays = (
+            scale == 1
+            and request.layer == "joint"
+            and request.residual
+            and scene.uses_graphs
+            and not request.marks.selected
+        )
         is_warm_up = replays and not scene.is_captured(size)
         with self._lock:
             start = time.perf_counter()
             camera = camera_of(request.pose, size, request.time)
             image = to_bytes(scene.play(camera.to(scene.device))) if replays else self._render_layer(request, camera)
+            image = with_outline(image, request.marks.outline)
             return Rendered(image, time.perf_counter() - start, is_warm_up)
 
     def _render_layer(self, request: RenderRequest, camera: Camera) -> Image:
-        return render_layer(request.layer, self._splats_of(request), camera, request.scene.config.render_settings)
+        splats, selected = self._splats_of(request), request.marks.selected
+        if selected is not None:
+            splats = tinted(splats, rows_of(request.scene, selected))
+        return render_layer(request.layer, splats, camera, request.scene.config.render_settings)
 
     def _splats_of(self, request: RenderRequest) -> Splats:
         """The Gaussians of a request, kept while only the camera moves, so that the networks need not run again."""

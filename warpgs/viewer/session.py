@@ -103,7 +103,7 @@ class Session:
         self.panel = Panel(client.gui, training, width, is_narrow=self._canvas()[0] < NARROW)
         scale, capture = (KEYFRAME_SCALE, None) if training is None else (training.frustum_scale, training.capture)
         self.path = PathEditor(client.scene, self.panel.path, source.run, self, scale, capture)
-        self.cleanup = Cleanup(client.scene, self.panel, source, rendering, self._wake.set)
+        self.cleanup = Cleanup(client.scene, self.panel, source, rendering, self._wake.set, self._request)
         self._frustums = client.scene.add_frame(FRUSTUMS, show_axes=False, visible=False)
         if view is not None:
             self._restore(view)
@@ -255,8 +255,7 @@ class Session:
 
     def _show_thumbnail(self, training: TrainingCameras) -> bool:
         """Shows the image of the selected training camera in the panel; whether it can be read."""
-        image = training.thumbnail(self._selected(training))
-        if image is not None:
+        if (image := training.thumbnail(self._selected(training))) is not None:
             self.panel.truth.image = image
         return image is not None
 
@@ -316,12 +315,12 @@ class Session:
 
     def _request(self) -> RenderRequest | None:
         """The image that the camera and the controls ask for; None without a scene."""
-        scene, panel = self.cleanup.scene(), self.panel
-        if scene is None:
+        if (scene := self.cleanup.scene()) is None:
             return None
+        panel = self.panel
         controls = (panel.current_width, panel.current_layer, bool(panel.residual.value), panel.current_time)
         request = RenderRequest(scene, self._pose(), self._canvas(), *controls)
-        return request._replace(truth=self._truth_for(request))
+        return request._replace(truth=self._truth_for(request), marks=self.cleanup.selection.marks)
 
     def _truth_for(self, request: RenderRequest) -> tuple[int, float] | None:
         """The training camera whose image is shown beside, and which part; only from where and when it was recorded."""
@@ -352,9 +351,8 @@ class Session:
             self._resolution.add(width * height, now - start)
         self._shown, self._problem = Shown(request, scale), ""
         self._sent.append(now)
-        milliseconds = 1e3 * rendered.seconds
-        digits = 1 if milliseconds < 100 else 0  # the line must not wrap now and then, which would move all controls
-        self._cost = (f"{width} × {height} in {milliseconds:.{digits}f} ms", 1.0 / (now - start))
+        digits = 1 if rendered.seconds < 0.1 else 0  # the line must not wrap, which would move all controls
+        self._cost = (f"{width} × {height} in {1e3 * rendered.seconds:.{digits}f} ms", 1.0 / (now - start))
 
     def _pose(self) -> Pose:
         return self._steering.pose(self.panel.current_time, bool(self.panel.follow.value))
@@ -395,6 +393,5 @@ class Session:
         if self._shown is not None:
             recent, (cost, rate) = sum(now - sent < RATE_SECONDS for sent in self._sent), self._cost
             lines = about(self._shown.request.scene, cost, recent / RATE_SECONDS if recent > 2 else rate)
-        text = status_html(lines, notes)
-        if text != self.panel.status.content:
+        if (text := status_html(lines, notes)) != self.panel.status.content:
             self.panel.status.content = text

@@ -1,5 +1,6 @@
 """The scene to show: the newest checkpoint of a run folder."""
 
+import shutil
 import threading
 import time
 from pathlib import Path
@@ -7,16 +8,18 @@ from pathlib import Path
 import torch
 
 from warpgs.data.capture import Capture
+from warpgs.editing import objects
 from warpgs.editing.edited_scene import edited, with_edits, with_ids
 from warpgs.editing.edits_file import edits_in_use, save_edits
 from warpgs.editing.object_scene import ObjectScene, with_boxes
-from warpgs.editing.objects import known_objects
 from warpgs.editing.options import Editing, Edits
 from warpgs.errors import one_line
-from warpgs.runs import preview
+from warpgs.files import complete_or_absent
+from warpgs.runs import checkpoint, config_file, preview
 from warpgs.runs.opening import open_scene
 from warpgs.runs.run import Device, Run
 from warpgs.runs.trained import TrainedScene
+from warpgs.video import keyframes
 
 MAX_EDITED = 3
 """Maximum number of edits whose scenes are kept."""
@@ -59,7 +62,7 @@ class Source:
         assert self._scene is not None
         self._editing, self._capture = editing, capture
         self.edits = edits_in_use(self.run.folder, editing, self._scene)
-        is_known = not self._scene.varies and known_objects(self._scene, self.run.folder) is not None
+        is_known = not self._scene.varies and objects.known_objects(self._scene, self.run.folder) is not None
         notes = self.find_objects() if is_known or self.edits.about_objects else []
         scene, more = with_edits(self._scene, self.run.folder, editing, lambda: capture)
         self._edited[self.edits] = scene
@@ -102,6 +105,39 @@ class Source:
         self.edited(edits)
         assert self._scene is not None
         return save_edits(self.run.folder, self._editing, edits, self._scene)
+
+    @property
+    def can_copy(self) -> bool:
+        """Whether it is of a run folder, not of files of other programs."""
+        return (self.run.folder / config_file.NAME).exists()
+
+    def copy(self, name: str, edits: Edits) -> Path:
+        """Saves the plan and the checkpoint that is shown as another run beside this one, with edits of its own.
+
+        Raises:
+            ValueError: If the name is none for a folder or taken, the edits cannot be made, or the run was trained
+                further since it was opened.
+            OSError: If it cannot be written.
+        """
+        self.edited(edits)
+        assert self._scene is not None
+        folder, newest = self.run.folder.resolve().parent / name, self.run.newest_checkpoint()
+        if not keyframes.NAME.fullmatch(name):
+            raise ValueError(f"the name of a run must have 1 to 64 letters, digits, spaces, - and _, got {name!r}")
+        if folder.exists():
+            raise ValueError(f"{folder} exists already: choose another name")
+        iteration = self._scene.metadata.iteration
+        if newest is None or newest.name != checkpoint.path_of(folder, iteration).name:
+            raise ValueError(f"the run was trained beyond iteration {iteration:,}, which is shown: open it again")
+        with complete_or_absent(folder) as partial:
+            copied = checkpoint.path_of(partial, iteration)
+            copied.parent.mkdir()
+            shutil.copyfile(newest, copied)
+            for file in (config_file.NAME, objects.NAME):
+                if (self.run.folder / file).exists():
+                    shutil.copyfile(self.run.folder / file, partial / file)
+            save_edits(partial, Editing(), edits, self._scene)
+        return folder
 
     @property
     def device(self) -> torch.device:
