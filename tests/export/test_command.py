@@ -126,6 +126,14 @@ def test_a_page_has_the_name_of_the_run_folder_as_its_title(run, monkeypatch):
     assert start_view(clouds_of(Path()), None, keys=2, seconds=1.0).title == "the run"
 
 
+def test_a_page_has_a_title_and_a_picture_at_an_address(run, tmp_path):
+    assert "scene.preview.png: " in export(run, tmp_path, format="html", keys=1, title="Mine", url="https://a.org")
+    assert names(tmp_path) == ["scene.html", "scene.preview.png"]
+    text = (tmp_path / "out/scene.html").read_text()
+    assert "<title>Mine</title>" in text
+    assert 'content="https://a.org/scene.preview.png"' in text
+
+
 @pytest.mark.parametrize("options", [{"editing": Editing(Edits(max_gaussians=9))}, {}])
 def test_a_page_opens_its_capture_once(run, tmp_path, monkeypatch, options):
     opened, read = [], opening.open_capture
@@ -216,7 +224,7 @@ def test_a_page_shows_images_as_the_config_says(run):
 def test_a_file_can_be_given_instead_of_a_folder(run, tmp_path, file, options):
     path = tmp_path / "new" / file
     assert export(run, tmp_path, out=path, **options).startswith(f"{path}: ")
-    assert [written.name for written in path.parent.iterdir()] == [file]
+    assert {written.name for written in path.parent.iterdir()} - {"a.preview.png"} == {file}
     assert path.is_file()
 
 
@@ -365,6 +373,8 @@ def test_data_replaces_the_folder_of_the_capture(stranded, data, tmp_path):
         ({"out": Path("a.ply"), "frames": 2}, "--frames writes several files: --out must be a folder, not a file as a"),
         ({"out": Path("a.ply"), "layers": "apart"}, "--layers apart writes several files: --out must be a folder"),
         ({"editing": Editing(Edits(max_gaussians=0))}, "--max-gaussians must be at least 1"),
+        ({"format": "html", "url": "a.org"}, "--url must be an address such as .*, got 'a.org'"),
+        ({"title": "a"}, "--title is for --format html, not for ply"),
         ({"format": "html", "max_megabytes": -1.0}, "--max-megabytes must be positive"),
         ({"format": "html", "max_megabytes": 0.001}, r"the page would hold .* use about --max-gaussians \d+"),
     ],

@@ -219,7 +219,7 @@ def test_the_player_restores_the_same_values(tmp_path, static, dynamic, keys):
     weights = np.geomspace(1.0, 1e4, static + dynamic).astype(np.float32)
     baked = bake(scenes.clouds(static, dynamic).at, evenly_spaced(keys), weights=weights)
     write_page(tmp_path / "scene.html", baked, start())
-    player = re.search(r"const BASIS_UNIT = .*?\n(?=function boundsOf)", page._player("", ""), re.DOTALL)[0]
+    player = re.search(r"const BASIS_UNIT = .*?\n(?=function boundsOf)", page._player("", "", ""), re.DOTALL)[0]
     printed = json.loads(node.run(tmp_path, PROGRAM % player, tmp_path / "scene.html"))
     for name in ("static", "dynamic"):
         for part in PARTS:

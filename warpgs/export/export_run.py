@@ -16,6 +16,7 @@ from .job import Job, Writer
 from .moving import SECONDS
 from .options import Export
 from .page import MAX_KEYS
+from .share import check_url
 from .writers import WRITERS
 
 COUNTS = {"frames": MAX_FRAMES, "keys": MAX_KEYS}
@@ -125,6 +126,8 @@ def _check_values(options: Export) -> None:
         value = getattr(options, name)
         if value is not None and not (math.isfinite(value) and value > 0):
             raise ValueError(f"{_flag(name)} must be positive, got {value}")
+    if options.url is not None:
+        check_url(options.url)
 
 
 def _flag(name: str) -> str:

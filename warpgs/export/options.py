@@ -43,6 +43,11 @@ class Export:
     """Refuse to write a page whose Gaussians take more memory than this, before compression [MB]; 256 by default."""
     precision: float | None = None
     """Divide the quantisation steps of a page by this; 1 by default, for about 40 dB against the scene itself."""
+    title: str | None = None
+    """Title of a page; the name of the run folder by default."""
+    url: str | None = None
+    """Address of the folder in which a page will be (https://example.org/scenes): where its own address is shared,
+    services show its picture then."""
     editing: Annotated[Editing, tyro.conf.arg(name="")] = field(default_factory=Editing)
     data: Path | None = None
     """Current folder of the capture, if it was moved; a page starts at one of its cameras."""

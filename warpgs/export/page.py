@@ -11,7 +11,7 @@ import json
 import re
 import zlib
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from jaxtyping import Int32
 
 from warpgs.command_line.progress import progress
 from warpgs.editing.contribution import contribution, sample_cameras
-from warpgs.files import write_bytes
+from warpgs.files import write_bytes, write_png
 from warpgs.formats.packing import to_planes
 from warpgs.video.camera_paths import evenly_spaced
 from warpgs.video.filmed import DRAG_LIMIT, REACH, Filmed
@@ -29,6 +29,7 @@ from warpgs.video.filmed import DRAG_LIMIT, REACH, Filmed
 from .baking import PARTS, Baked, Branch, bake, texture_bytes
 from .job import Job, Writer
 from .moving import KEYS, SECONDS
+from .share import card, picture, picture_path
 from .start_camera import StartView, start_view
 from .transform import Levels
 
@@ -52,8 +53,15 @@ REPLACED = "\0\r<"
 """Characters that a page cannot hold as they are: browsers replace NUL, CR becomes LF, and < could end the element."""
 
 
-def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True) -> int:
+def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True, url: str | None = None) -> int:
     """Writes the page; returns its size [bytes].
+
+    Args:
+        path: The file.
+        baked: The scene.
+        start: How the page starts.
+        quiet: Whether to show no progress.
+        url: Address of the folder in which it will be; None if that is not known.
 
     Raises:
         ValueError: If the scene has more key times or Gaussians than browsers support.
@@ -76,7 +84,8 @@ def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True) -
         blocks.append(_packed(f"{name}-{part}", _differences(levels.levels) if part == DIFFERENCES else levels.levels))
         blocks.append(_packed(f"{name}-{part}-basis", levels.basis[:, :, None]))
     blocks += [_packed(f"{name}-octaves", branch.octaves[None, :, None]) for name, branch in branches.items()]
-    return write_bytes(path, [_player(start.title, "\n".join(blocks)).encode()])
+    shared = card(start, len(baked.static) + len(baked.dynamic), path, url)
+    return write_bytes(path, [_player(start.title, shared, "\n".join(blocks)).encode()])
 
 
 def check_size(counts: Mapping[str, int], keys: int) -> None:
@@ -96,10 +105,10 @@ def check_size(counts: Mapping[str, int], keys: int) -> None:
             raise ValueError(f"a page holds at most {MAX_GAUSSIANS:,} {name} Gaussians, got {count:,}")
 
 
-def _player(title: str, blocks: str) -> str:
-    """The player with a scene in it."""
+def _player(title: str, shared: str, blocks: str) -> str:
+    """The player with a scene in it, and the elements for programs that show it where its address is shared."""
     folder = resources.files(__package__) / "player"
-    given = {"title": html.escape(title), "scene": blocks}
+    given = {"title": html.escape(title), "card": shared, "scene": blocks}
 
     def content(placeholder: re.Match[str]) -> str:
         name = placeholder[1]
@@ -174,14 +183,18 @@ def _write(job: Job) -> str:
     keys = options.keys or KEYS
     _check_memory(job, keys)
     start = start_view(job.clouds, job.capture, keys, options.seconds or SECONDS)
+    start = start if options.title is None else replace(start, title=options.title)
     scene = job.clouds.scene
     weights = contribution(scene, sample_cameras(scene, job.capture), options.quiet).largest.numpy()
     times = progress(evenly_spaced(keys), "baking", options.quiet)
     baked = bake(job.clouds.at, times, options.precision or 1.0, weights)
-    size = write_page(path, baked, start, options.quiet)
+    size = write_page(path, baked, start, options.quiet, options.url)
+    write_png(picture_path(path), picture(scene, start))
     count = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
-    return f"{path}: {count}, {size / 1e6:.1f} MB\nviews and camera path: {job.capture_note}"
+    shared = f"{picture_path(path).name}: its picture where its address is shared"
+    return f"{path}: {count}, {size / 1e6:.1f} MB\n{shared}\nviews and camera path: {job.capture_note}"
 
 
-PAGE = Writer(_write, ("keys", "seconds", "max_megabytes", "precision"), ".html", has_background=True, y_up=None)
+OPTIONS = ("keys", "seconds", "max_megabytes", "precision", "title", "url")
+PAGE = Writer(_write, OPTIONS, ".html", has_background=True, y_up=None)
 """The format "html"."""
