@@ -1,12 +1,16 @@
 """A headless Chromium, controlled over two pipes, without any other package."""
 
 import base64
+import contextlib
+import functools
+import http.server
 import json
 import os
 import select
 import shutil
 import subprocess
 import sys
+import threading
 import time
 
 import cv2
@@ -29,6 +33,20 @@ os.execv(sys.argv[3], sys.argv[3:])
 
 TIMEOUT = 90.0
 """Maximum duration of any step [s]: test machines are busy."""
+
+
+@contextlib.contextmanager
+def served(folder):
+    """Serves a folder; the value is its address."""
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
 
 
 def executable():

@@ -3,17 +3,14 @@
 ``npm install --global @sparkjsdev/spark three``. Version 2.2 reads SPZ up to version 3.
 """
 
-import functools
-import http.server
 import json
-import threading
 from urllib.parse import quote
 
 import numpy as np
 import pytest
 
 from tests.export import node, scenes
-from tests.export.browser import Browser, executable
+from tests.export.browser import Browser, executable, served
 from warpgs.export import orientation
 from warpgs.formats.compressed import write_compressed
 from warpgs.formats.rotation import rotated
@@ -84,18 +81,11 @@ try {
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     """A folder that is served, and its address."""
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_):
-            pass
-
     folder = tmp_path_factory.mktemp("site")
     (folder / "npm").symlink_to(node.packages())
     (folder / "index.html").write_text(PAGE)
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield folder, f"http://127.0.0.1:{server.server_port}/"
-        server.shutdown()
+    with served(folder) as address:
+        yield folder, address
 
 
 @pytest.fixture(scope="module")

@@ -56,6 +56,15 @@ class Orbit {
     this.pivot = addScaled(camera.position, camera.rotation[2], this.distance);
   }
 
+  look(position, target) {
+    // From a position at the target, upright.
+    const ahead = addScaled(target, position, -1), z = normalized(ahead), side = cross(z, this.up);
+    const x = Math.hypot(...side) > 1e-6 ? normalized(side) : this.first.rotation[0]; // straight up or down
+    this.rotation = [x, cross(z, x), z];
+    this.distance = Math.hypot(...ahead);
+    this.pivot = target;
+  }
+
   get camera() {
     return {rotation: this.rotation, position: addScaled(this.pivot, this.rotation[2], -this.distance)};
   }

@@ -1,4 +1,6 @@
 // Mouse, touch, keys and the bar at the bottom of the page.
+const EMBEDDED = window.parent !== window;
+document.body.classList.toggle('embedded', EMBEDDED);
 const update = () => { state.changed = true; };
 const toggle = () => { state.playing = !state.playing; update(); };
 const home = () => { element('follow').checked = track.length > 0; orbit.reset(); update(); };
@@ -13,6 +15,10 @@ const zoomed = moving((steps) => orbit.zoom(Math.exp(steps))), zoom = (factor) =
 const pointers = new Map();
 element('play').onclick = toggle;
 element('home').onclick = home;
+element('link').onclick = () => {
+  history.replaceState(null, '', addressHere()); // where the clipboard is not allowed, the address bar has it
+  navigator.clipboard?.writeText(location.href).catch(() => {});
+};
 element('time').oninput = () => { state.playing = false; state.time = Number(element('time').value); update(); };
 for (const id of [...NAMES, 'follow']) element(id).onchange = update;
 canvas.oncontextmenu = (event) => event.preventDefault();
@@ -38,6 +44,7 @@ canvas.onpointermove = (event) => {
   pointers.set(event.pointerId, [event.clientX, event.clientY]);
 };
 canvas.addEventListener('wheel', (event) => {
+  if (EMBEDDED && !document.hasFocus()) return; // until a click, the page around it scrolls
   event.preventDefault();
   zoom(Math.exp(event.deltaY / 800));
 }, {passive: false});

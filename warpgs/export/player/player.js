@@ -88,18 +88,30 @@ const track = START.track.map(cameraOf);
 const numberOf = (value) => Number.isFinite(parseFloat(value)) ? Math.min(1, Math.max(0, parseFloat(value))) : 0;
 element('follow-label').hidden = track.length === 0;
 
-function applyAddress() { // e.g. #time=0.5&play=0&layers=dynamic
-  const options = new URLSearchParams(location.hash.slice(1));
-  const layers = NAMES.filter((name) => options.get('layers')?.includes(name));
+function applyAddress() {
+  // Options after ? or #, e.g. ?autoplay=0&time=0.5&camera=0,0,-3,0,0,0 (position and target); those after # can change.
+  const options = new URLSearchParams(`${location.search.slice(1)}&${location.hash.slice(1)}`);
+  const option = (name) => options.getAll(name).pop();
+  const layers = NAMES.filter((name) => option('layers')?.includes(name)), view = (option('camera') ?? '').split(',').map(Number);
   for (const name of NAMES) element(name).checked = !layers.length || layers.includes(name);
-  state.time = numberOf(options.get('time'));
-  state.playing = options.get('play') !== '0';
+  state.time = numberOf(option('time'));
+  state.playing = (option('autoplay') ?? option('play')) !== '0'; // "play" in links to pages of earlier versions
   state.changed = true;
-  element('controls').hidden = options.get('controls') === '0';
-  element('follow').checked = options.get('follow') !== '0' && track.length > 0;
+  element('controls').hidden = option('controls') === '0';
+  element('follow').checked = option('follow') !== '0' && track.length > 0;
+  const position = view.slice(0, 3), target = view.slice(3);
+  if (view.length !== 6 || !view.every(Number.isFinite) || String(position) === String(target)) return;
+  element('follow').checked = false;
+  orbit.look(position, target);
 }
 applyAddress();
 addEventListener('hashchange', applyAddress);
+
+function addressHere() {
+  // The page's address at this time and view.
+  const numbers = [...orbit.camera.position, ...orbit.pivot].map((v) => Number(v.toPrecision(6)));
+  return `${location.href.split('#')[0]}#autoplay=${Number(state.playing)}&time=${state.time.toFixed(4)}&camera=${numbers}`;
+}
 
 function currentCamera() {
   if (element('follow').checked) {
