@@ -56,7 +56,7 @@ def executable():
 class Browser:
     """One page in its own browser, with a profile in ``folder``."""
 
-    def __init__(self, folder, width, height):
+    def __init__(self, folder, width, height, scale=1, mobile=False):
         commands, self._to = os.pipe()
         self._from, answers = os.pipe()
         size = f"--window-size={width},{height}"
@@ -71,7 +71,7 @@ class Browser:
         os.close(answers)
         self._received, self._last, self.events, self._session = b"", 0, [], None
         self._first = None
-        self._size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self._size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": mobile}
 
     def __enter__(self):
         return self
@@ -88,6 +88,7 @@ class Browser:
         for domain in ("Network", "Runtime", "Log", "Page"):
             self.call(f"{domain}.enable")
         self.call("Emulation.setDeviceMetricsOverride", **self._size)
+        self.call("Emulation.setTouchEmulationEnabled", enabled=self._size["mobile"])
         if self._first is not None:
             self.call("Page.addScriptToEvaluateOnNewDocument", source=self._first)
         self.call("Page.navigate", url=address)

@@ -121,8 +121,24 @@ function currentCamera() {
   return orbit.camera;
 }
 
-function resized() {
-  const width = Math.round(canvas.clientWidth * devicePixelRatio), height = Math.round(canvas.clientHeight * devicePixelRatio);
+const MAX_RATIO = 2, SLOWEST = 1 / 30, FAST = 1 / 60, COARSEST = 0.4, REST = 0.25; // pixels per CSS pixel, [s], [s], of all, [s]
+const pace = {part: 1, seconds: FAST, idle: Infinity};
+function paced(seconds) {
+  // The part of the pixels per axis to draw: fewer while images that change take longer than a thirtieth of a second.
+  const rested = pace.idle > REST;
+  pace.idle = state.changed ? 0 : pace.idle + seconds;
+  if (pace.idle > REST) {
+    if (!rested) Object.assign(pace, {part: Math.min(1, 1.25 * pace.part), seconds: FAST}); // tries more next time
+    return 1;
+  }
+  pace.seconds = 0.9 * pace.seconds + 0.1 * Math.min(seconds, 0.1); // one late frame does not count
+  if (pace.seconds > 1.1 * SLOWEST && pace.part > COARSEST) Object.assign(pace, {part: Math.max(COARSEST, 0.8 * pace.part), seconds: FAST});
+  return pace.part;
+}
+
+function resized(part) {
+  const ratio = part * Math.min(devicePixelRatio, MAX_RATIO);
+  const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
   if (canvas.width === width && canvas.height === height) return;
   canvas.width = width;
   canvas.height = height;
@@ -193,14 +209,14 @@ function showTime() {
 }
 
 function frame(now) {
-  advance(now);
-  resized();
+  const part = paced(advance(now));
+  resized(part);
   if (state.changed || !state.rendered) {
     const camera = currentCamera();
     state.changed = !sortFor(camera);
     render(camera);
     state.rendered = true;
-    if (state.sorted) document.body.dataset.state = state.sorting || state.changed ? 'playing' : 'settled';
+    if (state.sorted) document.body.dataset.state = state.sorting || state.changed || part < 1 ? 'playing' : 'settled';
     showTime();
     element('outside').hidden = !FILMED || outsideOf(FILMED, camera) <= 1;
   }
