@@ -444,3 +444,20 @@ def test_points_have_the_same_depths_and_pixels():
     assert relative_error(found[2].cpu(), expected[2]) < 1e-6
     assert sum(int((a != b.cpu()).sum()) for a, b in zip(expected[:2], found[:2], strict=True)) <= 4  # at borders
     assert torch.equal(expected[3], found[3].cpu())
+
+
+def test_garbage_with_another_graph_does_not_break_a_capture():
+    """Freeing the memory of a graph is not allowed during a capture."""
+    values = torch.ones(1000, device="cuda")
+
+    def work():
+        for _ in range(10_000):  # each is garbage that Python would collect on its way
+            cycle = []
+            cycle.append(cycle)
+        return (values * 2.0,)
+
+    garbage = [capture(lambda: (values.repeat(100_000) + 1.0,))]
+    garbage.append(garbage)
+    del garbage
+    (doubled,) = capture(work)()
+    assert torch.equal(doubled, torch.full_like(values, 2.0))

@@ -1,5 +1,6 @@
 """The cache of CUDA graphs; without a GPU, a replay is simulated by repeating the work."""
 
+import gc
 from unittest.mock import MagicMock
 
 import pytest
@@ -141,3 +142,34 @@ def test_an_error_inside_a_capture_is_not_hidden_by_that_of_its_end(capture_end,
 def test_an_error_at_the_end_of_a_capture_is_raised(capture_end):
     with pytest.raises(RuntimeError, match="previous error"):
         graphs.record(lambda: (torch.ones(1),))
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_garbage_is_not_collected_during_a_capture(enabled, monkeypatch):
+    """Freeing the memory of another graph makes a capture invalid."""
+    seen = []
+
+    class Graph:
+        def capture_begin(self, _pool, capture_error_mode):
+            seen.append(gc.isenabled())
+
+        def capture_end(self):
+            seen.append(gc.isenabled())
+
+    def work():
+        seen.append(gc.isenabled())
+        raise KeyError
+
+    monkeypatch.setattr(graphs.torch, "cuda", MagicMock(CUDAGraph=Graph, mem_get_info=lambda: (1,)))
+    monkeypatch.setattr(graphs.torch.cuda, "memory_reserved", lambda: 0)
+    monkeypatch.setattr(graphs.torch.cuda, "memory_allocated", lambda: 0)
+    monkeypatch.setattr(graphs, "side_stream", lambda device: None)
+    before = gc.isenabled()
+    (gc.enable if enabled else gc.disable)()
+    try:
+        with pytest.raises(KeyError):
+            graphs.record(work)
+        assert seen == [False, False, False]
+        assert gc.isenabled() == enabled
+    finally:
+        (gc.enable if before else gc.disable)()

@@ -1,8 +1,9 @@
 """CUDA graphs: work that is recorded once and replayed with a single launch."""
 
 import contextlib
+import gc
 import threading
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -124,17 +125,30 @@ def record(
             torch.cuda.empty_cache()
         with torch.cuda.stream(stream):
             side_stream(stream.device)  # created here, because a capture cannot create streams
-            graph.capture_begin(pool, capture_error_mode="thread_local")  # other threads may go on using the GPU
-            try:
-                outputs = work()
-            except BaseException:
-                with contextlib.suppress(RuntimeError):  # an error of the work often makes its capture invalid
-                    graph.capture_end()
-                raise
-            graph.capture_end()
+            with _without_collection():
+                graph.capture_begin(pool, capture_error_mode="thread_local")  # other threads may go on using the GPU
+                try:
+                    outputs = work()
+                except BaseException:
+                    with contextlib.suppress(RuntimeError):  # an error of the work often makes its capture invalid
+                        graph.capture_end()
+                    raise
+                graph.capture_end()
 
     def replay() -> tuple[Tensor, ...]:
         graph.replay()
         return outputs
 
     return replay
+
+
+@contextlib.contextmanager
+def _without_collection() -> Iterator[None]:
+    """No garbage is collected: freeing the memory of another graph makes a capture invalid."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
