@@ -1,6 +1,7 @@
 """Cameras for other programs: these see points where the capture's cameras see them, at the same times."""
 
 import dataclasses
+import importlib
 import json
 import shutil
 
@@ -16,9 +17,9 @@ from warpgs.data.ply import read_ply_points
 from warpgs.distortion import Distortion
 from warpgs.export.camera_set import CameraSet
 from warpgs.export.camera_writers import CAMERA_FORMATS, write_cameras
-from warpgs.export.orientation import AXES, upright
 from warpgs.runs.run import Run
 from warpgs.video.given_cameras import read_cameras
+from warpgs.video.orientation import AXES, upright, vertical
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -218,6 +219,146 @@ def test_cameras_of_blender_are_read_back(tmp_path):
     )
 
 
+@pytest.fixture
+def pxr():
+    """The module of OpenUSD."""
+    pytest.importorskip("pxr.Usd", reason="usd-core is not installed (extra 'export')")
+    return importlib.import_module("pxr")
+
+
+def test_cameras_of_usd_are_read_back_as_they_were(tmp_path, pxr):
+    made = written(tmp_path, "usd")
+    read = read_cameras(tmp_path / "cameras.usdc", made)
+    for view, back in zip(made.cameras.values(), read, strict=True):
+        assert (back.viewmat - view.viewmat).abs().max() < 1e-6
+        assert pytest.approx(view.K, rel=1e-6) == back.K
+        assert back.size == view.size
+        assert back.time == pytest.approx(view.time, abs=1e-12)
+    only = read_cameras(tmp_path / "cameras.usdc", made, "evaluation")
+    assert [camera.time for camera in only] == [made.cameras["view 2"].time]
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdc", "usdz", "usd"])
+def test_usd_of_all_kinds_is_read(tmp_path, pxr, suffix):
+    from pxr import Sdf, UsdUtils
+
+    made, path = written(tmp_path, "usd"), tmp_path / f"other.{suffix}"
+    if suffix == "usdz":
+        UsdUtils.CreateNewUsdzPackage(str(tmp_path / "cameras.usdc"), str(path))
+    else:
+        Sdf.Layer.FindOrOpen(str(tmp_path / "cameras.usdc")).Export(str(path))
+    read, expected = read_cameras(path, made), read_cameras(tmp_path / "cameras.usdc", made)
+    assert torch.equal(torch.cat([c.viewmat for c in read]), torch.cat([c.viewmat for c in expected]))
+
+
+def animated(path, axis="Y", unit=1.0, still=False):
+    """A file of another program: a camera in a scaled group, which moves up from time code 11 to 15."""
+    from pxr import Gf, Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, axis)
+    UsdGeom.SetStageMetersPerUnit(stage, unit)
+    group = UsdGeom.Xform.Define(stage, "/rig")
+    group.AddScaleOp().Set(Gf.Vec3f(2, 2, 2))
+    prim = UsdGeom.Camera.Define(stage, "/rig/main")
+    prim.CreateHorizontalApertureAttr(36.0)
+    prim.CreateVerticalApertureAttr(24.0)
+    prim.CreateFocalLengthAttr(50.0)
+    move, up = prim.AddTranslateOp(), np.array([0.0, 1.0, 0.0] if axis == "Y" else [0.0, 0.0, 1.0])
+    if axis == "Z":
+        prim.AddRotateXOp().Set(90.0)  # looks along y with z up
+    if still:
+        move.Set(Gf.Vec3d(*(up / unit)))
+    else:
+        stage.SetStartTimeCode(11)
+        stage.SetEndTimeCode(15)
+        move.Set(Gf.Vec3d(*(up / unit)), 11)
+        move.Set(Gf.Vec3d(*(3 * up / unit)), 15)
+    stage.Save()
+    return stage
+
+
+@pytest.mark.parametrize(("axis", "unit"), [("Y", 1.0), ("Z", 1.0), ("Y", 0.01), ("Z", 0.01)])
+def test_a_camera_of_another_program_films_at_each_time_code(tmp_path, pxr, axis, unit):
+    animated(tmp_path / "shot.usda", axis, unit)
+    made = capture()
+    read = read_cameras(tmp_path / "shot.usda", made)
+    to_file = upright(vertical(made), y_up=True)
+    assert [camera.time for camera in read] == [0.0, 0.25, 0.5, 0.75, 1.0]
+    for k, seen_from in enumerate(read):
+        assert to_file @ seen_from.position.numpy() == pytest.approx([0.0, 2 + k, 0.0], abs=1e-5)
+        assert seen_from.viewmat[:3, :3].numpy() @ to_file.T == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-6)
+        assert seen_from.size == (720, 480)
+        assert seen_from.K.diagonal().tolist() == pytest.approx([1000.0, 1000.0, 1.0])
+        assert seen_from.K[:2, 2].tolist() == [360.0, 240.0]
+
+
+def test_a_still_camera_films_the_whole_scene(tmp_path, pxr):
+    animated(tmp_path / "shot.usda", still=True)
+    read = read_cameras(tmp_path / "shot.usda", capture())
+    assert [read[0].time, read[-1].time, len(read)] == [0.0, 1.0, 120]
+    assert torch.equal(read[0].viewmat, read[-1].viewmat)
+
+
+def test_one_of_several_cameras_is_chosen_by_its_name(tmp_path, pxr):
+    stage, path = animated(tmp_path / "shot.usda"), tmp_path / "shot.usda"
+    importlib.import_module("pxr.UsdGeom").Camera.Define(stage, "/rig/side").AddTranslateOp().Set((5.0, 0.0, 0.0))
+    stage.Save()
+    with pytest.raises(ValueError, match="has 2 such cameras, choose one by --view: /rig/main, /rig/side"):
+        read_cameras(path, capture())
+    for name in ("side", "/rig/side"):
+        assert len(read_cameras(path, capture(), name)) == 5
+    with pytest.raises(ValueError, match="has no camera top; its cameras are: /rig/main, /rig/side"):
+        read_cameras(path, capture(), "top")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("float focalLength = 50", "float focalLength = 0", "must have a positive focal length"),
+        ("float horizontalAperture = 36", "float horizontalAperture = nan", "must have a positive focal length"),
+        (
+            "float horizontalAperture = 36",
+            "float horizontalAperture = 1e6",
+            "would have an image of 7,864,320 × 480 pixels",
+        ),
+        ("float focalLength = 50", 'token projection = "orthographic"', "projection perspective"),
+        ("float focalLength = 50", "float horizontalApertureOffset = 99", "outside of the image"),
+        ("(2, 2, 2)", "(2, 2, -2)", "is more than turned, scaled and moved"),
+        ("(2, 2, 2)", "(0, 0, 0)", "is more than turned, scaled and moved"),
+        ("(2, 2, 2)", "(inf, 1, 1)", "is more than turned, scaled and moved"),
+        ("endTimeCode = 15", "endTimeCode = 1e9", "expected time codes of at most"),
+        ("endTimeCode = 15", "endTimeCode = 1", "expected time codes of at most"),
+        ("metersPerUnit = 1", "metersPerUnit = 0", "metersPerUnit must be positive"),
+        ("metersPerUnit = 1", "subLayers = [@./other.usda@]", "refers to other files"),
+        ('def Xform "rig"', 'def Xform "rig" (references = @./other.usda@)', "refers to other files"),
+        ('def Xform "rig"', 'def Xform "rig" (payload = @./other.usda@)', "refers to other files"),
+        ('def Camera "main"', 'def Xform "main"', "has no camera; its cameras are: none"),
+        ("metersPerUnit = 1", "customLayerData = {double warpgsRotation = 2}", "must be a rotation"),
+        ('def Camera "main"', 'def Camera "main" (customData = {string warpgsSize = "big"})', "must be two integers"),
+        ("#usda", "#other", "is not a file of OpenUSD"),
+        ("upAxis", "up Axis {", "is not a file of OpenUSD"),
+    ],
+)
+def test_usd_that_is_no_camera_path_is_refused(tmp_path, pxr, old, new, message):
+    path = tmp_path / "shot.usda"
+    animated(path)
+    text = path.read_text()
+    assert old in text
+    changed = tmp_path / "changed.usda"
+    changed.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=message) as error:
+        read_cameras(changed, capture())
+    assert str(changed) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_name_is_for_cameras_of_usd(tmp_path):
+    made = written(tmp_path, "nerfstudio")
+    with pytest.raises(ValueError, match="--view chooses a camera of a file of OpenUSD"):
+        read_cameras(tmp_path, made, "view 2")
+
+
 def test_colmap_cameras_that_are_no_frames_are_evenly_spaced_in_time(tmp_path):
     made = written(tmp_path, "colmap", rotation=np.eye(3))
     others = Capture("other", {"a": camera(0)}, ["a"], [], POINTS, None, lambda name: None)
@@ -346,5 +487,6 @@ def test_another_file_than_one_of_cameras_is_refused_by_what_it_should_be(run, t
     (tmp_path / "scene.ply").write_bytes(b"ply\n\xff")
     assert main(["render", str(run), "--cameras", str(tmp_path / "scene.ply")]) == 2
     assert (
-        "scene.ply is neither a transforms.json nor a folder that has one or a COLMAP model" in capsys.readouterr().err
+        "scene.ply is neither a transforms.json, a USD file nor a folder that has a COLMAP model"
+        in capsys.readouterr().err
     )

@@ -16,7 +16,7 @@ from warpgs.captures.opening import load_capture
 from warpgs.cli import main
 from warpgs.data.capture import Capture
 from warpgs.editing.options import Editing, Edits
-from warpgs.export import orientation, page
+from warpgs.export import page
 from warpgs.export.clouds import Clouds
 from warpgs.export.export_run import export_run
 from warpgs.export.job import Writer
@@ -28,7 +28,7 @@ from warpgs.formats.standard import read_standard
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
-from warpgs.video import camera_paths
+from warpgs.video import camera_paths, orientation
 from warpgs.video.filmed import position_and_axis
 
 pytestmark = pytest.mark.usefixtures("quickly")

@@ -12,11 +12,11 @@ from warpgs.export import fourdgs, usd
 from warpgs.export.clouds import Clouds
 from warpgs.export.job import Job
 from warpgs.export.options import Export
-from warpgs.export.orientation import AXES, upright
 from warpgs.formats.cloud import Cloud, logit
 from warpgs.formats.rotation import rotated
 from warpgs.model.gaussians import SH_C0
 from warpgs.runs.run import Run
+from warpgs.video.orientation import AXES, upright
 
 KEYS, SECONDS = 5, 2.0
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from tests.export import scenes
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
-from warpgs.export import orientation
 from warpgs.formats.rotation import rotated
+from warpgs.video import orientation
 
 ROTATIONS = {
     "any": Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(),

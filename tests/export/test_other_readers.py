@@ -15,7 +15,6 @@ import torch
 
 from tests.export import node, scenes
 from warpgs.data.ply import read_ply
-from warpgs.export import orientation
 from warpgs.formats.cloud import Cloud, logit, sigmoid
 from warpgs.formats.compressed import write_compressed
 from warpgs.formats.gltf import write_glb
@@ -24,6 +23,7 @@ from warpgs.formats.sog import write_sog
 from warpgs.formats.spz import write_spz, write_spz_gzip
 from warpgs.formats.standard import read_standard, write_standard
 from warpgs.model.gaussians import SH_C0
+from warpgs.video import orientation
 from warpgs.video.camera_paths import UP
 
 SPLAT_TRANSFORM = shutil.which("splat-transform")

@@ -11,12 +11,12 @@ import pytest
 
 from tests.export import node, scenes
 from tests.export.browser import Browser, executable, served
-from warpgs.export import orientation
 from warpgs.formats.compressed import write_compressed
 from warpgs.formats.rotation import rotated
 from warpgs.formats.sog import write_sog
 from warpgs.formats.spz import write_spz_gzip
 from warpgs.formats.standard import write_standard
+from warpgs.video import orientation
 from warpgs.video.camera_paths import UP
 
 pytestmark = [

@@ -13,9 +13,9 @@ from warpgs.data.capture import Capture
 from warpgs.editing.edited_scene import with_edits
 from warpgs.runs.run import Run
 from warpgs.runs.scene_file import SceneFile
+from warpgs.video import orientation
 from warpgs.video.camera_paths import UP
 
-from . import orientation
 from .clouds import Clouds
 from .options import Export
 

@@ -13,9 +13,9 @@ from warpgs.formats.cloud import Cloud
 from warpgs.video import camera_paths
 from warpgs.video.camera_paths import UP
 from warpgs.video.filmed import Filmed
+from warpgs.video.orientation import vertical
 
 from .clouds import Clouds
-from .orientation import vertical
 
 
 @dataclass(frozen=True)

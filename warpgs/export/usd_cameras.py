@@ -8,20 +8,17 @@ the principal point. Time code k is k / (N - 1) of the duration, for N times of 
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warpgs.cameras import Camera
 from warpgs.formats.packages import required
+from warpgs.video.usd_cameras import OPENCV_FROM_OPENGL, ROTATION, SIZE
 
 from .camera_set import CameraSet
 from .usd import save_stage
 
 FOCAL_LENGTH = 50.0
 """Focal length of all cameras [tenths of a scene unit]."""
-
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
-"""From x right, y up, z backward to x right, y down, z forward."""
 
 TRAINING = "training"
 """Prim of the training camera; of several, with the id of each after it."""
@@ -35,6 +32,7 @@ def write_usd_cameras(folder: Path, cameras: CameraSet) -> None:
     path = folder / "cameras.usdc"
     Usd, UsdGeom, Gf = (required(path, f"pxr.{name}", "usd-core") for name in ("Usd", "UsdGeom", "Gf"))
     stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().customLayerData = {ROTATION: Gf.Matrix3d(*cameras.rotation.ravel().tolist())}
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Cameras").GetPrim())
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -47,6 +45,7 @@ def write_usd_cameras(folder: Path, cameras: CameraSet) -> None:
         camera = UsdGeom.Camera.Define(stage, f"/Cameras/{prim}")
         camera.CreateClippingRangeAttr(Gf.Vec2f(NEAR, FAR))
         camera.CreateFocalLengthAttr(FOCAL_LENGTH)
+        camera.GetPrim().SetCustomDataByKey(SIZE, Gf.Vec2i(*next(iter(by_time.values())).size))
         _animate(camera, {last * time: by_time[time] for time in sorted(by_time)}, path)
     save_stage(stage, path)
 

@@ -1,4 +1,4 @@
-"""Cameras from files, to film at exactly: a COLMAP model, or a transforms.json as nerfstudio and Blender have it.
+"""Cameras from files, to film at exactly: COLMAP models, OpenUSD, and transforms.json as of nerfstudio and Blender.
 
 They are in the coordinates of the scene. ``applied_transform`` of a transforms.json says how these became those of the
 file, and is undone.
@@ -23,34 +23,46 @@ from warpgs.data.loaders.transforms import Transforms
 from warpgs.files import natural_order, read_numbers
 
 from .camera_paths import MAX_FRAMES, evenly_spaced, filling
+from .usd_cameras import SUFFIXES, read_usd_cameras
 
 INDEX = "transforms.json"
 
 
-def read_cameras(path: Path, capture: Capture) -> list[Camera]:
+def read_cameras(path: Path, capture: Capture, name: str | None = None) -> list[Camera]:
     """The cameras of a file, with the size of the first one, in the order of their times, else of their names.
 
     Without times, those that are called like frames of the capture have their times; others are evenly spaced.
 
     Args:
-        path: A transforms.json, or a folder that has one or a COLMAP model.
+        path: A transforms.json, or a folder that has one or a COLMAP model, or a file of OpenUSD.
         capture: The capture of the run.
+        name: Of the camera in a file of OpenUSD.
 
     Raises:
         ValueError: If there is no such file, it is damaged, a lens is not supported, a time is outside of [0, 1], or it
-            has none and only some cameras are called like frames.
+            has none and only some cameras are called like frames; or as ``read_usd_cameras``.
+        OSError: As ``read_usd_cameras``.
     """
+    if path.suffix in SUFFIXES and not path.is_dir():
+        return _in_time(read_usd_cameras(path, capture, name))
+    if name is not None:
+        raise ValueError(f"--view chooses a camera of a file of OpenUSD ({', '.join(SUFFIXES)}), not of {path}")
     if path.is_dir() and not (path / INDEX).is_file():
         named, times = _of_colmap(path)
     else:
         index = path / INDEX if path.is_dir() else path
         if index.suffix != ".json":
-            raise ValueError(f"{path} is neither a transforms.json nor a folder that has one or a COLMAP model")
+            raise ValueError(f"{path} is neither a transforms.json, a USD file nor a folder that has a COLMAP model")
         named, times = _of_transforms(index)
     if len(named) > MAX_FRAMES:
         raise ValueError(f"{path} has {len(named):,} cameras, the maximum is {MAX_FRAMES:,}")
     times = times or _times_of_frames(path, [name for name, _ in named], capture)
-    by_time = sorted(zip(times or evenly_spaced(len(named)), (camera for _, camera in named), strict=True), key=_time)
+    return _in_time([*zip(times or evenly_spaced(len(named)), (camera for _, camera in named), strict=True)])
+
+
+def _in_time(timed: list[tuple[float, Camera]]) -> list[Camera]:
+    """The cameras in the order of their times, with the size of the first one."""
+    by_time = sorted(timed, key=_time)
     first = by_time[0][1]
     cameras = [dataclasses.replace(camera, time=float(time)) for time, camera in by_time]
     return [camera if camera.size == first.size else filling(camera, first.size) for camera in cameras]

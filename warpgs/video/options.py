@@ -27,12 +27,12 @@ class Render:
     """JSON file of keyframes to follow instead (docs/viewing.md)."""
     cameras: Path | None = None
     """Film at exactly the cameras of a transforms.json or of the folder of a COLMAP model instead, in the coordinates
-    of the scene."""
+    of the scene; or of a USD file (.usd, .usda, .usdc, .usdz), in those of exported files."""
     out: Path | None = None
     """Output folder; RUN/render/PATH by default."""
     view: str | None = None
     """Id of the start view of fixed, spiral and bullet; by default the middle evaluation view. Without it, bullet
-    follows the training camera, unless that jumps from frame to frame."""
+    follows the training camera, unless that jumps from frame to frame. Of a USD file, the camera."""
     time: float | None = None
     """Time in [0, 1] of frozen and spiral, and at which bullet stops; default 0.5, but all times for spiral."""
     frames: int | None = None

@@ -28,7 +28,7 @@ FRAMES = 120
 
 PATHS_OF_OPTION = {
     "truth": ("views",),
-    "view": ("fixed", "spiral", "bullet"),
+    "view": ("fixed", "spiral", "bullet", "cameras"),
     "time": ("frozen", "spiral", "bullet"),
     "lens": ("fixed", "frozen", "moving", "spiral", "bullet"),
     "frames": ("fixed", "frozen", "moving", "spiral", "bullet", "keyframes"),
@@ -127,7 +127,7 @@ def _cameras(options: Render, capture: Capture, dynamic: Tensor, means: Tensor) 
     if options.cameras is not None:
         from .given_cameras import read_cameras  # imports loaders
 
-        return _numbered(read_cameras(options.cameras, capture))
+        return _numbered(read_cameras(options.cameras, capture, options.view))
     if options.path_name == "views":
         if not capture.val:
             raise ValueError(f"{capture.name} has no evaluation views; choose another --path")
