@@ -480,7 +480,7 @@ def test_without_a_tool_clicks_are_not_heard(cleanup):
     assert cleanup.selection.marks.outline == ()
 
 
-@pytest.mark.parametrize("position", [(np.nan, 0.5), (0.5, np.inf)])
+@pytest.mark.parametrize("position", [(np.nan, 0.5), (0.5, np.inf), (0.5,), ("a", 0.5), None])
 def test_positions_that_no_screen_has_are_ignored(cleanup, position):
     cleanup.controls.tool.value = LASSO
     click(cleanup, position)
@@ -577,6 +577,7 @@ def test_objects_of_a_training_that_is_followed_are_not_found(run):
     cleanup.controls.find.click()
     assert not cleanup.controls.find.visible
     assert not (run / OBJECTS).exists()
+    assert note(cleanup).startswith("objects are found in finished runs")
 
 
 def test_objects_that_there_are_not_cannot_be_chosen(with_objects):

@@ -47,6 +47,8 @@ HANDLE_SIZE = 0.15
 QUANTILES = (0.01, 0.99)
 """Of the Gaussians' centres, along each axis: where a new box begins and ends."""
 
+NO_OBJECTS = "objects are found in finished runs: open one without --while-training, and no sequence of files"
+
 DIGITS = 3
 """Decimals of the positions of its corners."""
 
@@ -153,6 +155,8 @@ class Cleanup:
     def find_objects(self) -> None:
         """Finds objects, for all browsers, unless they are known."""
         if not self._source.can_find_objects:
+            if not self._can_edit:
+                self._note(NO_OBJECTS)
             return
         self._note("finding objects")
         try:

@@ -170,5 +170,8 @@ def _rows(scene: TrainedScene, mask: Bool[np.ndarray, " N"]) -> Int64[np.ndarray
 
 def _point(position: Any) -> Point | None:
     """A position on the screen that a browser sent; None if it has none."""
-    x, y = (float(value) for value in position)
+    try:
+        x, y = (float(value) for value in position)
+    except (TypeError, ValueError):
+        return None
     return (min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)) if math.isfinite(x) and math.isfinite(y) else None
