@@ -6,7 +6,8 @@ A pixel p composites the Gaussians of its tile in depth order; with d = mean2d -
     T_0 = 1,  T_{i+1} = T_i (1 - alpha_i),  stopped before T would fall to TRANSMITTANCE_MIN,
     image = Σ_i alpha_i T_i feature_i + T_end background.
 
-Depth, the channel after the image's, has no background and is normalised: divided by max(alpha, MIN_ALPHA).
+Depth, the channel after the image's, has no background and is normalised: divided by max(alpha, MIN_ALPHA). The median
+depth instead is that of the last Gaussian with T_i > ½, as in 2DGS (Huang et al. 2024).
 
 With branches, one launch makes three images: 0 joint, 1 static Gaussians only, 2 dynamic Gaussians only. Each image has
 its own lane groups, which traverse its own lists: with the state of a single image more groups fit on a multiprocessor,
@@ -60,7 +61,7 @@ from .tiles import DYNAMIC
 
 @functools.cache
 def make_composite_fwd(
-    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], statistics: bool
+    num_features: int, with_depth: bool, images: int, pixels: tuple[int, int], statistics: bool, median: bool = False
 ) -> wp.Kernel:
     """Forward kernel, ``lane_count()`` threads for each block of pixels in each image.
 
@@ -70,12 +71,14 @@ def make_composite_fwd(
         images: 1 or 3, see above; ``branch_lengths``, ``half`` and ``joint_state`` are only used with 3.
         pixels: Columns and rows of the pixels that a lane owns.
         statistics: Whether ``contributed`` and ``weights`` are written; they describe the joint image.
+        median: Whether the depth is the median.
 
     The kernel's ``background`` has ``num_features`` values per image, ``background_stride`` apart. ``joint_state`` has
     one value for each block of an image, initially zero; see ``equals_joint``. ``transmittance`` and ``last`` are saved
     for the backward pass by the traversal of each image; they may be unset where an image equals the joint image.
     """
     C = num_features + int(with_depth)
+    num_sums = num_features if median else C
     columns, rows_per_lane = pixels
     P = columns * rows_per_lane
     vectorized = is_vectorized(pixels)
@@ -186,8 +189,11 @@ def make_composite_fwd(
                             t_next = t - alpha * t
                             closes = hit and t_next <= TRANSMITTANCE_MIN
                             w = wp.where(closes, 0.0, alpha * t)
-                            for c in range(wp.static(C)):
+                            for c in range(wp.static(num_sums)):
                                 color[c * wp.static(P) + k] += w * features[c]
+                            if wp.static(num_sums < C):
+                                d = wp.static(num_features * P) + k
+                                color[d] = wp.where(w > 0.0 and t > 0.5, features[wp.static(num_features)], color[d])
                             T[k] = wp.where(closes, -t, t_next)
                             seen = (tags | tag) & wp.static(branch_bits)
                             n[k] = wp.where(hit, seen | wp.where(closes, tags, tag), tags)
@@ -214,8 +220,13 @@ def make_composite_fwd(
                                         n[k] = n[k] | (tag & wp.static(branch_bits))
                                     else:
                                         w = alpha * t
-                                        for c in range(wp.static(C)):
+                                        for c in range(wp.static(num_sums)):
                                             color[c * wp.static(P) + k] += w * features[c]
+                                        if wp.static(num_sums < C):
+                                            if t > 0.5:
+                                                color[wp.static(num_features * P) + k] = features[
+                                                    wp.static(num_features)
+                                                ]
                                         T[k] = t_next
                                         n[k] = tag | (n[k] & wp.static(branch_bits))
                                         weight += w
@@ -257,7 +268,7 @@ def make_composite_fwd(
                                     value += t * background[m * background_stride + c]
                                 image[p, c] = value
                             if wp.static(num_features < C):
-                                depth_sum = color[wp.static(num_features * P) + k]
-                                depth[p] = depth_sum / wp.max(1.0 - t, MIN_ALPHA)
+                                found = color[wp.static(num_features * P) + k]
+                                depth[p] = found / wp.where(wp.static(num_sums < C), 1.0, wp.max(1.0 - t, MIN_ALPHA))
 
     return composite_fwd

@@ -74,3 +74,8 @@ def test_compositing_compiles(make, variant, images, pixels, tmp_path):
 @pytest.mark.parametrize("channels", [1, 9])
 def test_compositing_compiles_for_other_channels(make, channels, tmp_path):
     assert_compiles(make(channels, False, 1, CUDA_PIXELS, False).module, tmp_path)
+
+
+@pytest.mark.parametrize("pixels", [CUDA_PIXELS, SMALL_IMAGE_CUDA_PIXELS])
+def test_median_depth_compiles(pixels, tmp_path):
+    assert_compiles(make_composite_fwd(3, True, 1, pixels, False, True).module, tmp_path)

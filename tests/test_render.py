@@ -65,6 +65,14 @@ def test_images_statistics_and_gradients_equal_the_reference(channels, options):
     assert_same_gradients(outputs(result), expected, inputs, doubles)
 
 
+def test_median_depth_with_a_gradient_is_refused():
+    settings, splats = RenderSettings(depth=True, median=True), make_splats()
+    with torch.no_grad():
+        assert (render(splats, CAMERA, settings=settings).joint.depth > 0).any()
+    with pytest.raises(ValueError, match="median depth has no gradient"):
+        render(dataclasses.replace(splats, means=splats.means.clone().requires_grad_()), CAMERA, settings=settings)
+
+
 @pytest.mark.parametrize("depth", [False, True])
 def test_each_image_may_have_its_own_background(depth):
     splats, behind = as_leaves(make_splats()), torch.rand(3, 3, generator=generator()).requires_grad_()

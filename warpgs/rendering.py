@@ -32,8 +32,8 @@ class Layer(NamedTuple):
     Attributes:
         image: [H, W, C] composited over the background.
         alpha: [H, W] opacity, in [0, 1).
-        depth: [H, W] mean depth of the Gaussians, weighted by their contribution [scene units]; 0 in empty pixels.
-            None unless requested.
+        depth: [H, W] mean depth of the Gaussians, weighted by their contribution [scene units], or their median depth;
+            0 in empty pixels. None unless requested.
     """
 
     image: Float[Tensor, "H W C"]
@@ -147,7 +147,7 @@ def render(
     Raises:
         TypeError: If the camera is something else, such as a list of cameras.
         ValueError: If the background or the offsets do not fit the splats, devices differ, or branches are requested
-            for splats without ``is_dynamic``.
+            for splats without ``is_dynamic``, or median depth where a gradient is.
         RuntimeError: If a CUDA graph captures the first render of an image size without
             ``RenderSettings.max_intersections``.
     """
@@ -166,6 +166,8 @@ def _rendered(
     splats: Splats, camera: Camera, screen_offsets: Tensor | None, background: Tensor | None, settings: RenderSettings
 ) -> Rendering:
     inputs = _inputs(splats, camera, background, settings, screen_offsets)
+    if settings.median and torch.is_grad_enabled() and any(map(_has_gradient, inputs)):
+        raise ValueError("median depth has no gradient: render it with torch.no_grad()")
     outputs = differentiable(partial(_forward, _request(splats, camera, settings)), *inputs)
     return _rendering(outputs, settings)
 
@@ -290,7 +292,7 @@ def _forward(request: _Request, *tensors: Any) -> Recorded:
     tape.record_func(back.project, [])
     tiles = bin_splats(rows, order, size, inputs.branch, settings.max_intersections)
     composite, back.traversal = composite_fwd(
-        rows, tiles, size, inputs.background, settings.statistics, settings.max_alpha
+        rows, tiles, size, inputs.background, settings.statistics, settings.max_alpha, settings.median
     )
     tape.record_func(back.composite, [])
 

@@ -132,6 +132,25 @@ def test_a_fully_opaque_splat_gets_no_gradient_where_it_is_clamped(max_alpha):
     assert_same_gradients(result.alphas, [alpha], single[2:3], double[2:3])
 
 
+@pytest.mark.parametrize("is_dynamic", [None, torch.arange(40) % 3 == 0])
+def test_median_depth_is_that_of_the_splat_at_which_half_of_the_light_is_left(is_dynamic):
+    means2d, conics, opacities, features, background, depths = inputs = make_walled_inputs()
+    splats = Projection(means2d, conics, depths, opacities, torch.full(means2d.shape, 1000, dtype=torch.int32))
+    rows, order = pack(splats, features, with_depth=True)
+    tiles = bin_splats(rows, order, SIZE, None if is_dynamic is None else is_dynamic.view(torch.uint8))
+    result, _ = composite_fwd(rows, tiles, SIZE, background, False, 0.999, median=True)
+    selections = [None] if is_dynamic is None else [None, ~is_dynamic, is_dynamic]
+    by_depth = depths.argsort()
+    for depth, image, selected in zip(result.depths, result.images, selections, strict=True):
+        expected_image, alpha, weights = theirs([t.double() for t in inputs], selected=selected)
+        sorted_weights = weights[by_depth]
+        before = 1.0 - sorted_weights.cumsum(0) + sorted_weights
+        reached = ((sorted_weights > 0) & (before > 0.5)) * depths[by_depth, None, None]
+        assert (alpha > 0.9).any()
+        assert (reached.amax(0) != depth).float().mean() < 0.001  # of single and double precision
+        assert error(image, expected_image) < 2e-6
+
+
 def make_clamped_inputs():
     """Wide splats, the first of which has a larger alpha than 0.99 in a third of the pixels, in front of the others."""
     inputs = make_inputs(3)

@@ -16,6 +16,8 @@ class RenderSettings:
     Attributes:
         branches: Also render the static and the dynamic Gaussians alone, from the same sorted lists.
         depth: Also render depth, as one more channel.
+        median: That depth is the median instead of the mean: that of the Gaussian at which the transmittance falls to
+            one half, or of the last one where it does not. It has no gradient.
         statistics: Also compute whether and how much each Gaussian contributed to the joint image.
         absgrad: The gradient of ``screen_offsets`` is the sum over the pixels of all images of the absolute values of
             each pixel's contribution, per axis (AbsGS, Ye et al. 2024; gsplat's ``absgrad``).
@@ -27,6 +29,7 @@ class RenderSettings:
 
     branches: bool = False
     depth: bool = False
+    median: bool = False
     statistics: bool = False
     absgrad: bool = False
     antialias: bool = False

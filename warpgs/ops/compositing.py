@@ -42,7 +42,8 @@ class Composite(NamedTuple):
     Attributes:
         images: [H, W, C] each.
         alphas: [H, W] each, opacity in [0, 1 - 1e-4).
-        depths: [H, W] each, mean depth weighted by contribution [scene units], 0 in empty pixels; none without depth.
+        depths: [H, W] each, mean depth weighted by contribution, or median depth [scene units], 0 in empty pixels; none
+            without depth.
         statistics: Nothing, or [N] whether the Gaussian changed a pixel of the joint image and [N] sum of its alpha
             times transmittance over that image; not differentiable.
     """
@@ -110,45 +111,59 @@ def _layout(size: tuple[int, int], tiles: Tiles) -> tuple[tuple[int, int], int, 
 
 
 def composite_fwd(
-    rows: Rows, tiles: Tiles, size: tuple[int, int], background: Tensor | None, statistics: bool, max_alpha: float
+    rows: Rows,
+    tiles: Tiles,
+    size: tuple[int, int],
+    background: Tensor | None,
+    statistics: bool,
+    max_alpha: float,
+    median: bool = False,
 ) -> tuple[Composite, Traversal]:
     """Composites packed rows: three images if the tiles have branches, otherwise one.
 
     Args:
-        rows: N packed splats.
-        tiles: Of the same rows.
+        rows, tiles: N packed splats, and their tiles.
         size: (width, height) [px].
         background: [features], or [images, features] with one for each image; None is black. Depth has none.
         statistics: Whether to report the contribution of each Gaussian.
-        max_alpha: As in ``RenderSettings``.
+        max_alpha, median: As in ``RenderSettings``.
 
     Raises:
         ValueError: If all images together have too many pixels to be counted.
     """
-    width, height = size
-    num_images = 1 if tiles.branch_lengths is None else NUM_BRANCH_IMAGES
-    if num_images * height * width >= MAX_PIXELS:
-        raise ValueError(f"{num_images} images of {width} x {height} pixels are too large to be rendered at once")
-    packed, num_features, with_depth = rows
+    num_images, (packed, num_features, with_depth) = _num_images(tiles, size), rows
     new = packed.new_empty
     pixels, blocks, lanes = _layout(size, tiles)
     stride = 0 if background is None or background.ndim == 1 else num_features
-    shape = (height, width) if num_images == 1 else (num_images, height, width)
+    shape = size[::-1] if num_images == 1 else (num_images, *size[::-1])
     image, alpha, depth = new(*shape, num_features), new(*shape), new(*shape) if with_depth else None
     own_depth = None if depth is None else depth.detach()  # an output itself would keep its own node alive
     joint_state = None if num_images == 1 else tiles.ranges.new_zeros(blocks)
     state = PixelState(own_depth, new(*shape), tiles.ranges.new_empty(*shape), joint_state)
     lists = (tiles.ranges, tiles.branch_lengths, tiles.gaussian_from_isect, tiles.half)
     traversal = Traversal(num_images, pixels, num_images * blocks * lanes, lists, (stride, *size, max_alpha), state)
-    contributed = packed.new_zeros(packed.shape[0], dtype=torch.uint8) if statistics else None
-    weights = packed.new_zeros(num_shards(packed), packed.shape[0]) if statistics else None
-    kernel = make_composite_fwd(num_features, with_depth, num_images, pixels, statistics)
+    contributed, weights = _statistics(packed) if statistics else (None, None)
+    kernel = make_composite_fwd(num_features, with_depth, num_images, pixels, statistics, median)
     inputs = (*traversal.lists, packed, background, *traversal.view)
     outputs = (image, depth, alpha, state.transmittance, state.last, state.joint_state, contributed)
     launch(kernel, traversal.num_threads, *inputs, *outputs, per_shard=(weights,), block_dim=BLOCK_DIM, work=WORK)
     found = () if contributed is None or weights is None else (contributed.view(torch.bool), weights.sum(0))
     images, alphas, depths = (_layers(t, num_images) for t in (image, alpha, depth))
     return Composite(images, alphas, depths, found), traversal
+
+
+def _num_images(tiles: Tiles, size: tuple[int, int]) -> int:
+    """The number of images of tiles; raises ValueError if they have too many pixels."""
+    (width, height), number = size, 1 if tiles.branch_lengths is None else NUM_BRANCH_IMAGES
+    if number * height * width >= MAX_PIXELS:
+        raise ValueError(f"{number} images of {width} x {height} pixels are too large to be rendered at once")
+    return number
+
+
+def _statistics(packed: Tensor) -> tuple[Tensor, Tensor]:
+    """Zeros for ``contributed`` and, of each shard, ``weights``."""
+    count = packed.shape[0]
+    return packed.new_zeros(count, dtype=torch.uint8), packed.new_zeros(num_shards(packed), count)
 
 
 def _layers(tensor: Tensor | None, num_images: int) -> tuple[Tensor, ...]:
