@@ -26,7 +26,7 @@ ORDER = [
     "synthetic",
     "captures",
     "runs",
-    "video editing",
+    "video editing meshing",
     "evaluation",
     "initialization",
     "training prepare",

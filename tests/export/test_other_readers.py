@@ -1,8 +1,8 @@
 """Exported files as other programs read them; skipped where these are not installed.
 
 ``npm install --global @playcanvas/splat-transform @mkkellogg/gaussian-splats-3d gsplat three`` and
-``pip install fourdgs gsplat``; Spark is in ``test_spark.py``. Version 2 of splat-transform reads SPZ with
-Niantic's decoder, with y up as specified; version 3 leaves the axes as they are in the file, as if y were down.
+``pip install fourdgs gsplat trimesh pygltflib``; Spark is in ``test_spark.py``. Version 2 of splat-transform reads SPZ
+with Niantic's decoder, with y up as specified; version 3 leaves the axes as they are in the file, as if y were down.
 """
 
 import json
@@ -14,10 +14,13 @@ import pytest
 import torch
 
 from tests.export import node, scenes
+from tests.export.test_mesh import tetrahedron
 from warpgs.data.ply import read_ply
 from warpgs.formats.cloud import Cloud, logit, sigmoid
 from warpgs.formats.compressed import write_compressed
 from warpgs.formats.gltf import write_glb
+from warpgs.formats.mesh import write_mesh_ply
+from warpgs.formats.mesh_gltf import write_mesh_glb
 from warpgs.formats.rotation import rotated
 from warpgs.formats.sog import write_sog
 from warpgs.formats.spz import write_spz, write_spz_gzip
@@ -71,6 +74,51 @@ def test_fourdgs_reads_gltf(tmp_path, degree):
     color = np.concatenate([0.5 + SH_C0 * cloud.sh[:, 0], sigmoid(cloud.logit_opacities)[:, None]], 1)
     assert read.gaussians.colors == pytest.approx(np.clip(color, 0, 1), abs=1e-5)
     assert read.gaussians.sh_degree == degree
+
+
+def test_trimesh_reads_meshes(tmp_path):
+    trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
+    frames = [tetrahedron(shift, color) for shift, color in ((0.0, (255, 0, 0)), (3.0, (0, 128, 255)))]
+    write_mesh_glb(tmp_path / "a.glb", tetrahedron(-3.0), frames, 2.0)
+    read = trimesh.load(tmp_path / "a.glb", process=False)
+    assert sorted(read.geometry) == ["dynamic_00000", "dynamic_00001", "static"]
+    assert read.bounds == pytest.approx(np.array([[-3, -3, -3], [1, 1, 1]]))  # the second frame has no size yet
+    for k, mesh in enumerate(frames):
+        found = read.geometry[f"dynamic_{k:05d}"]
+        assert found.is_watertight
+        assert found.volume == pytest.approx(1 / 6)
+        assert (found.vertices == mesh.vertices).all()
+        write_mesh_ply(tmp_path / "a.ply", mesh)
+        again = trimesh.load(tmp_path / "a.ply", process=False)
+        assert again.volume == pytest.approx(1 / 6)
+        assert (again.visual.vertex_colors[:, :3] == mesh.colors).all()
+
+
+def test_pygltflib_reads_a_mesh_and_its_animation(tmp_path):
+    pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed")
+    write_mesh_glb(tmp_path / "a.glb", tetrahedron(), [tetrahedron(), tetrahedron()], 2.0)
+    read = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
+    blob = read.binary_blob()
+
+    def values(index, kind):
+        accessor = read.accessors[index]
+        start = read.bufferViews[accessor.bufferView].byteOffset
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor.type]
+        return np.frombuffer(blob, kind, accessor.count * width, start).reshape(-1, width)
+
+    primitive = read.meshes[0].primitives[0]
+    colors = values(primitive.attributes.COLOR_0, "<u2")[0] / 65535
+    assert colors == pytest.approx([1.0, 0.216, 0.0, 1.0], abs=1e-3)  # 128 of 255 in sRGB, linear
+    assert read.materials[primitive.material].extensions == {"KHR_materials_unlit": {}}
+    (animation,) = read.animations
+    samplers = [animation.samplers[channel.sampler] for channel in animation.channels]
+    assert [sampler.interpolation for sampler in samplers] == ["STEP", "STEP"]
+    assert [values(sampler.input, "<f4")[:, 0].tolist() for sampler in samplers] == [[0, 1, 2], [0, 1, 2]]
+    assert [values(sampler.output, "<f4")[:, 0].tolist() for sampler in samplers] == [[1, 0, 0], [0, 1, 1]]
+    assert [read.nodes[channel.target.node].name for channel in animation.channels] == [
+        "dynamic_00000",
+        "dynamic_00001",
+    ]
 
 
 GAUSSIAN_SPLATS_3D = """

@@ -25,7 +25,7 @@ COUNTS = {"frames": MAX_FRAMES, "keys": MAX_KEYS}
 REFLECTIONS_NOTE = "no format holds reflections: dynamic Gaussians have the colours of their spherical harmonics alone"
 """A line about scenes of ``model.reflections``."""
 
-POSITIVE = ("seconds", "max_megabytes", "precision")
+POSITIVE = ("seconds", "max_megabytes", "precision", "voxel")
 """Options that are positive numbers."""
 
 

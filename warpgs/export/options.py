@@ -19,8 +19,9 @@ class Export:
     over time."""
     format: str = "ply"
     """ply: PLY as 3DGS writes it. compressed: compressed PLY of SuperSplat and PlayCanvas. sog: SOG of PlayCanvas.
-    spz: SPZ of Niantic, version 4. spz3: SPZ, version 3. glb: binary glTF (KHR_gaussian_splatting). usd: OpenUSD with
-    time samples. 4dgs: container of moving scenes. html: one web page that plays the scene offline."""
+    spz: SPZ of Niantic, version 4. spz3: SPZ, version 3. glb: binary glTF (KHR_gaussian_splatting). mesh: binary glTF
+    of triangles that move, or PLY with --frames. usd: OpenUSD with time samples. 4dgs: container of moving scenes.
+    html: one web page that plays the scene offline."""
     out: Path | None = None
     """Output folder, or output file if this ends as files of the format do (scene.ply); RUN/export by default."""
     time: float | None = None
@@ -36,9 +37,11 @@ class Export:
     """Also write the cameras as training left them, in the coordinates of the file, to the folder cameras: colmap,
     nerfstudio or blender (transforms.json; of D-NeRF), or usd (OpenUSD, moving)."""
     keys: int | None = None
-    """Number of key times of html, usd and 4dgs, between which programs interpolate; 30 by default."""
+    """Number of key times of html, usd and 4dgs, between which programs interpolate, and of meshes; 30 by default."""
     seconds: float | None = None
-    """Duration of the scene in html, usd and 4dgs, and of --cameras usd [s]; 5 by default."""
+    """Duration of the scene in mesh, html, usd and 4dgs, and of --cameras usd [s]; 5 by default."""
+    voxel: float | None = None
+    """Size of the voxels of a mesh [scene units]; by default as small as a pixel, or larger if there are too many."""
     max_megabytes: float | None = None
     """Refuse to write a page whose Gaussians take more memory than this, before compression [MB]; 256 by default."""
     precision: float | None = None

@@ -8,6 +8,7 @@ from warpgs.formats.standard import write_standard
 
 from .fourdgs import FOURDGS
 from .job import Writer
+from .mesh import MESH
 from .page import PAGE
 from .per_time import per_time
 from .usd import USD
@@ -19,6 +20,7 @@ WRITERS: dict[str, Writer] = {
     "spz": per_time(".spz", write_spz, y_up=True),
     "spz3": per_time(".v3.spz", write_spz_gzip, y_up=True),
     "glb": per_time(".glb", write_glb, y_up=True),
+    "mesh": MESH,
     "usd": USD,
     "4dgs": FOURDGS,
     "html": PAGE,

@@ -8,11 +8,12 @@ no place for anti-aliasing. Axes are x right, y up, z towards the viewer.
 
 import json
 import struct
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from warpgs.files import write_bytes
 from warpgs.model.gaussians import SH_C0
@@ -40,15 +41,30 @@ def write_glb(path: Path, cloud: Cloud) -> int:
     if not len(cloud):
         raise ValueError(f"{path}: glTF needs at least one Gaussian, got none")
     arrays = _attributes(cloud)
-    text = json.dumps(_document(arrays), separators=(",", ":")).encode()
+    return write_document(path, _document(arrays), arrays.values(), "--max-gaussians")
+
+
+def write_document(path: Path, document: dict[str, Any], arrays: Iterable[np.ndarray], remedy: str) -> int:
+    """Writes a JSON document and arrays, one after the other in its only buffer; returns the size of the file [bytes].
+
+    Raises:
+        OSError: If it cannot be written; the message names the file.
+        ValueError: If it takes more than 4 GB; the message names the remedy.
+    """
+    text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    size = sum(array.nbytes for array in arrays.values())
+    size = document["buffers"][0]["byteLength"]
     total = 12 + 8 + len(text) + 8 + size
     if total > MAX_BYTES:
-        raise ValueError(f"{path}: a binary glTF file has at most 4 GB, got {total / 1e9:.1f} GB; use --max-gaussians")
+        raise ValueError(f"{path}: a binary glTF file has at most 4 GB, got {total / 1e9:.1f} GB; use {remedy}")
     header = struct.pack("<IIIII", MAGIC, 2, total, len(text), JSON_CHUNK)
-    buffers = (array.tobytes() for array in arrays.values())
+    buffers = (array.tobytes() for array in arrays)
     return write_bytes(path, [header, text, struct.pack("<II", size, BINARY_CHUNK), *buffers])
+
+
+def linear(srgb: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
+    """Linear colours of sRGB in [0, 1], as glTF stores colours of vertices."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _attributes(cloud: Cloud) -> dict[str, Float32[np.ndarray, "N _"] | UInt8[np.ndarray, "N 4"]]:
@@ -69,10 +85,9 @@ def _attributes(cloud: Cloud) -> dict[str, Float32[np.ndarray, "N _"] | UInt8[np
 
 
 def _fallback_color(cloud: Cloud, opacities: np.ndarray) -> UInt8[np.ndarray, "N 4"]:
-    """Colour and opacity of points for programs without the extension; glTF's vertex colours are linear, not sRGB."""
+    """Colour and opacity of points for programs without the extension."""
     color = np.clip(0.5 + SH_C0 * cloud.sh[:, 0].astype(np.float64), 0, 1)
-    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
-    return np.rint(255 * np.concatenate([linear, opacities], 1)).astype(np.uint8)
+    return np.rint(255 * np.concatenate([linear(color), opacities], 1)).astype(np.uint8)
 
 
 def _document(arrays: dict[str, np.ndarray]) -> dict[str, Any]:

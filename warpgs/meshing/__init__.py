@@ -1,0 +1,1 @@
+"""Triangle meshes of a scene: depth images, fused into signed distances, and the surfaces of these."""
