@@ -389,6 +389,20 @@ def points_around_the_block(depth):
     return CAMERA.unproject(row, column, depth)
 
 
+def test_of_many_views_a_random_part_is_read(monkeypatch):
+    monkeypatch.setattr(dynamic_points, "MAX_VIEWS", 4)
+    capture, read = make_capture(random_points(9), inverse_depth=constant_depth(), num_frames=40), []
+    views = Views(with_frames(capture, lambda name: read.append(name) or capture.frame(name)), torch.device("cpu"), 0)
+    alignments, mask_of = ALIGNMENT[:1].expand(40, 2), lambda view: ~view.static_mask
+    read.clear()
+    found = dynamic_points.unproject_pixels(views._capture, views, alignments, mask_of, 100, generator())
+    assert len(found.positions) == 100
+    chosen = found.views.unique().tolist()
+    assert len(chosen) == 4
+    assert chosen not in ([0, 1, 2, 3], [0, 10, 20, 30], [0, 13, 26, 39])
+    assert len({*read}) <= 4
+
+
 @pytest.mark.parametrize("inverse_depth", [None, mostly_unknown()])
 def test_without_depth_dynamic_gaussians_start_in_front_of_the_points_around_them(inverse_depth):
     points = points_around_the_block(torch.linspace(2.0, 3.0, 8))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import threading
 from collections.abc import Callable
 
 import cv2
@@ -22,6 +23,7 @@ from warpgs.initialization.depth_by_size import depth_by_size
 from warpgs.initialization.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth
 from warpgs.initialization.objects import MIN_VISIBLE, find_objects
 from warpgs.initialization.prepare_start import prepare_start
+from warpgs.runtime import launch
 from warpgs.training.trainer import Trainer
 from warpgs.views.views import Views
 
@@ -276,6 +278,29 @@ def test_an_object_is_followed_through_the_frames_of_one_camera():
     objects = module.find_all_objects(views_of(capture.with_cameras(cameras)))
     assert [sorted({k % 2 for k in item.pixels}) for item in objects] == [[0], [0], [1], [1]]
     assert all(len(item.whole) == NUM // 2 for item in objects)
+
+
+def test_cameras_are_followed_on_all_cores_with_the_results_of_one(monkeypatch):
+    """Frames that are not resident are read by several threads at once."""
+    masks, images = two_balls(np.linspace(-60, -33, NUM))
+    capture = capture_of(masks, images=images)
+    cameras = {name: dataclasses.replace(c, id=k % 3) for k, (name, c) in enumerate(capture.cameras.items())}
+    views, threads = views_of(capture.with_cameras(cameras), resident_bytes=0), set()
+    expected = [item for video in views.videos for order in (video, video[::-1]) for item in find_objects(views, order)]
+
+    def find(views, order):
+        threads.add(threading.get_ident())
+        return find_objects(views, order)
+
+    monkeypatch.setattr(objects, "find_objects", find)
+    monkeypatch.setattr(launch, "_num_cores", lambda: 2)
+    found = module.find_all_objects(views)
+    assert len(found) == len(expected) > 3
+    for item, other in zip(found, expected, strict=True):
+        assert (item.whole, item.cut, item.is_mixture) == (other.whole, other.cut, other.is_mixture)
+        assert item.pixels.keys() == other.pixels.keys()
+        assert all(np.array_equal(item.pixels[k], other.pixels[k]) for k in item.pixels)
+    assert threading.get_ident() not in threads
 
 
 def test_objects_that_part_are_told_apart_backward_in_time():

@@ -1,6 +1,6 @@
 """Points at which dynamic Gaussians start: pixels of what moves, unprojected."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -17,6 +17,9 @@ from warpgs.model.gaussians import Gaussians
 from warpgs.views.views import View, Views
 
 from .point_cloud import gaussians_at, random_points, subsample, unproject
+
+MAX_VIEWS = 1_000
+"""Maximum number of views whose pixels dynamic Gaussians start from: more only take time."""
 
 MAX_PIXELS_PER_GAUSSIAN = 8
 """Maximum number of dynamic pixels that are unprojected per initial dynamic Gaussian."""
@@ -137,7 +140,7 @@ def unproject_pixels(
     max_count: int,
     generator: torch.Generator,
 ) -> DynamicPoints | None:
-    """At most ``max_count`` random pixels of masks, unprojected by aligned depth.
+    """At most ``max_count`` random pixels of masks of at most ``MAX_VIEWS`` views, unprojected by aligned depth.
 
     Where it is known at too few of them, they are put before the sparse points around them, if any are seen.
 
@@ -152,7 +155,10 @@ def unproject_pixels(
     Returns:
         The points; None if the masks are empty.
     """
-    num = sum(int(mask_of(view).sum()) for view in views)
+    chosen: Sequence[int] = range(len(views))
+    if len(views) > MAX_VIEWS:  # at random, so that each camera of several has others
+        chosen = torch.randperm(len(views), generator=generator)[:MAX_VIEWS].sort().values.tolist()
+    num = sum(int(mask_of(view).sum()) for view in views.each(chosen))
     if num == 0:
         return None
     fraction = min(1.0, MAX_PIXELS_PER_GAUSSIAN * max_count / num)
@@ -161,17 +167,18 @@ def unproject_pixels(
     def known(index: int, view: View, mask: Tensor) -> Tensor:
         return depth_alignment.metric_depth(view.inverse_depth, alignments[index])
 
-    found = _unproject(views, mask_of, known, fraction, generator)
+    found = _unproject(views, chosen, mask_of, known, fraction, generator)
     depth_known = len(found[0]) >= MIN_KNOWN_FRACTION * fraction * num
     if not depth_known:
         estimated = partial(_depth_before_points, points, generator)
-        found = _unproject(views, mask_of, estimated, fraction, generator)
+        found = _unproject(views, chosen, mask_of, estimated, fraction, generator)
     positions, colors, indices = found
     return DynamicPoints(positions, colors, indices, depth_known).chosen(subsample(positions, max_count, generator))
 
 
 def _unproject(
     views: Views,
+    chosen: Sequence[int],
     mask_of: Callable[[View], Tensor],
     depth_of: Callable[[int, View, Tensor], Tensor],
     fraction: float,
@@ -179,7 +186,7 @@ def _unproject(
 ) -> tuple[Tensor, ...]:
     """Positions, colours and views of a random fraction of the masks' pixels, on the CPU."""
     parts = []
-    for index, view in enumerate(views):
+    for index, view in zip(chosen, views.each(chosen), strict=True):
         mask = mask_of(view)
         depth = depth_of(index, view, mask)
         if fraction < 1.0:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Int
 from warpgs.data.capture import Frame
 from warpgs.data.dynamic_regions import MIN_FRAMES, dynamic_regions, is_cut, scaled_size
 from warpgs.data.optical_flow import MIN_SIDE, flow_between, grey_at
+from warpgs.runtime.launch import on_all_cores
 from warpgs.views.views import Views
 
 MIN_OVERLAP = 0.3
@@ -58,8 +59,8 @@ def find_objects(views: Views, order: Sequence[int]) -> list[MovingObject]:
         order: Indices of those of one camera, by time or backward in time.
     """
     follower = _Follower()
-    for index, frame in zip(order, views.frames(order), strict=True):
-        follower.add(index, frame)
+    for index in order:
+        follower.add(index, views.frame(index))
     return follower.objects
 
 
@@ -72,8 +73,14 @@ def num_cut_off(objects: Sequence[MovingObject]) -> int | None:
 
 def find_all_objects(views: Views) -> list[MovingObject]:
     """The objects that the masks show by time, then those backward in time: what parts later is told apart before."""
-    orders = (order for video in views.videos for order in (video, video[::-1]))
-    return [item for order in orders for item in find_objects(views, order)]
+    orders = [order for video in views.videos for order in (video, video[::-1])]
+    found: list[list[MovingObject]] = [[] for _ in orders]
+
+    def find(k: int) -> None:
+        found[k] = find_objects(views, orders[k])
+
+    on_all_cores(find, len(orders))
+    return [item for of_order in found for item in of_order]
 
 
 class _Follower:
