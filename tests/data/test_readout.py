@@ -81,6 +81,12 @@ def test_frames_are_read_with_their_motion():
     assert capture.frame("a").camera.motion is capture.cameras["a"].motion
 
 
+@pytest.mark.parametrize("readout", [1.0, -0.4, 0.0])
+def test_the_duration_of_a_readout_is_a_part_of_the_time_between_training_frames(readout):
+    cameras = with_readout(filmed({"a": 0.0, "b": 0.25, "c": 0.5, "d": 1.0}, {"e": 0.75}), readout).cameras
+    assert [camera.duration for camera in cameras.values()] == pytest.approx([0.25 * readout] * len(cameras))
+
+
 def test_cameras_with_a_global_shutter_have_no_motion():
     assert all(camera.motion is None for camera in with_readout(filmed(TRAIN, VAL), 0.0).cameras.values())
 

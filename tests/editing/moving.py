@@ -14,9 +14,9 @@ class Passing(nn.Module):
 
     def forward(self, means, time):
         of_second = means[:, 1:2] > FAR / 2
-        x = torch.where(of_second, -1.0, 1.0) * (2.0 * time - 1.0) * torch.tensor([1.0, 0.0, 0.0])
+        x = torch.where(of_second, -1.0, 1.0) * (2.0 * time[:, None] - 1.0) * torch.tensor([1.0, 0.0, 0.0])
         y = torch.where(of_second, -FAR, 0.0) * torch.tensor([0.0, 1.0, 0.0])
-        growth = torch.where(of_second, 0.0, 1.0) * time * means
+        growth = torch.where(of_second, 0.0, 1.0) * time[:, None] * means
         return nn.functional.pad(x + y + growth, (0, 7))
 
 

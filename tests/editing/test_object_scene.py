@@ -1,5 +1,7 @@
 """Edits of objects change the Gaussians of these objects at all times, and no others."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -47,6 +49,14 @@ def test_a_frozen_object_is_as_at_its_time_while_others_move(scene):
         assert rows_equal(frozen.splats(time), scene.splats(0.3), FIRST)
         assert rows_equal(frozen.splats(time), scene.splats(time), STATIC)
         assert rows_equal(frozen.splats(time), scene.splats(time), SECOND)
+
+
+def test_a_rolling_shutter_sees_objects_at_the_times_of_its_rows_and_frozen_ones_at_theirs(scene):
+    camera = dataclasses.replace(scenes.camera(), motion=torch.zeros(2, 3), duration=0.4)
+    frozen = edited(scene, Edits(freeze=(("1", 0.3),))).splats(0.5, camera=camera)
+    assert rows_equal(frozen, scene.splats(0.3), FIRST)
+    assert rows_equal(frozen, scene.splats(0.5, camera=camera), SECOND)
+    assert not rows_equal(frozen, scene.splats(0.5), SECOND, ["means"])
 
 
 @pytest.mark.parametrize(("shift", "then"), [(0.5, 0.25), (-0.125, 0.875), (1.0, 0.0), (-1.0, 1.0)])

@@ -75,6 +75,15 @@ def test_a_camera_with_a_rolling_shutter_plays_as_it_is_rendered(trained, captur
     assert not torch.equal(trained.play(camera), trained.play(still))
 
 
+def test_each_row_shows_what_moves_where_it_is_then(trained):
+    camera = dataclasses.replace(scenes.camera(time=0.5), motion=torch.zeros(2, 3), duration=0.2)
+    times = [0.5 + ((row + 0.5) / camera.height - 0.5) * camera.duration for row in range(camera.height)]
+    rows = [trained.render(camera.pinhole, time=time).joint.image[row] for row, time in enumerate(times)]
+    rolling, still = (trained.render(seen).joint.image for seen in (camera, camera.pinhole))
+    expected = torch.stack(rows)
+    assert (rolling - expected).square().mean() < (still - expected).square().mean() / 10
+
+
 def test_a_time_of_numpy_is_rendered_like_one_of_python(trained):
     expected = trained.render(scenes.camera(), time=0.25).joint.image
     (time,) = np.linspace(0.25, 1.0, 1)

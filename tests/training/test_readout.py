@@ -10,9 +10,11 @@ from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.readout import with_readout
 from warpgs.data.units import SceneUnits
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.synthetic import room
 from warpgs.synthetic.bodies import as_tensors, even_samples
 from warpgs.synthetic.raytrace import raytrace
+from warpgs.training.trainer import Trainer
 
 SIZE, NUM_FRAMES, NUM_POINTS = (44, 32), 12, 300
 READOUT = 1.0
@@ -61,6 +63,22 @@ def recorded(readout: float) -> Capture:
     train = [name for name in frames if name not in val]
     cameras = {name: frame.camera for name, frame in frames.items()}
     return Capture("room", cameras, train, val, torch.cat(points), None, frames.__getitem__)
+
+
+def test_a_step_deforms_gaussians_at_the_times_of_their_rows(tmp_path, monkeypatch):
+    capture = with_readout(recorded(0.0), READOUT)
+    trainer = Trainer(prepare_start(tiny.CONFIG, capture), tmp_path)
+    trainer._add_dynamic_gaussians()
+    plan = trainer.protocol.at(trainer.protocol.stage2.start)
+    sample, asked = trainer._sample(plan)._replace(time_noise=0.0), []
+    forward = trainer.scene.deformation.forward
+    monkeypatch.setattr(trainer.scene.deformation, "forward", lambda m, t: asked.append(t) or forward(m, t))
+    trainer.step(plan, sample)
+    middle, times, *_ = asked
+    assert len(times) == len(trainer.scene.dynamic) > len(middle) == 1
+    assert times.unique().numel() > 1
+    assert (times - middle).abs().max() <= capture.interval
+    assert (times - middle).abs().max() > 0.1 * capture.interval
 
 
 def test_frames_of_a_rolling_shutter_are_learned_better_with_their_readout(tmp_path):

@@ -271,12 +271,14 @@ def test_a_path_through_cameras_of_two_sizes_has_one_size_and_one_field_of_view(
 
 def test_a_cropped_view_has_the_rolling_shutter_of_its_rows():
     motion = torch.tensor([[0.0, 0.0, 0.0], [0.4, 0.1, 0.0]])
-    whole = dataclasses.replace(camera(), motion=motion)
+    whole = dataclasses.replace(camera(), motion=motion, duration=0.1)
     cropped = paths.filling(whole, (64, 24))
     rows, columns, depth = torch.tensor([2, 12, 20]), torch.tensor([10, 30, 50]), torch.full((3,), 2.0)
     assert torch.allclose(
         cropped.unproject(rows, columns, depth), whole.unproject(rows + 12, columns, depth), atol=1e-6
     )
+    points = whole.unproject(rows + 12, columns, depth)
+    assert torch.allclose(cropped.delays(points), whole.delays(points), atol=1e-6)
 
 
 def test_the_training_path_is_of_the_camera_with_the_most_frames():

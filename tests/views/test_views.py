@@ -109,6 +109,14 @@ def test_lenses_are_one_if_they_show_the_same_pixels(circles, shares):
     assert cameras.have_one_lens == shares
 
 
+@pytest.mark.parametrize(("durations", "shares"), [((0.1, 0.1), True), ((0.1, 0.2), False)])
+def test_cameras_are_constants_of_a_graph_if_they_are_read_in_one_time(durations, shares):
+    still = dataclasses.replace(along_z(20.0, (50, 37)), motion=torch.zeros(2, 3))
+    cameras = StackedCameras([dataclasses.replace(still, duration=duration) for duration in durations], CPU)
+    assert cameras.have_one_lens == shares
+    assert [cameras.at(torch.tensor([k]), k, (50, 37)).duration for k in range(2)] == [*durations]
+
+
 def test_each_view_has_the_motion_of_its_camera(capture):
     second = capture.train[1]
     assert views_of(capture)[0].camera.motion is None

@@ -60,4 +60,5 @@ def _moving(capture: Capture, names: Sequence[str], duration: float) -> dict[str
     speeds = poses[:, :, :3].swapaxes(1, 2) @ CubicSpline(times, poses)(times, 1)
     turns = 0.5 * np.stack([speeds[:, a, b] - speeds[:, b, a] for a, b in ((2, 1), (0, 2), (1, 0))], 1)
     motions = torch.tensor(duration * np.stack([turns, speeds[:, :, 3]], 1), dtype=torch.float32)
-    return {name: replace(c, motion=motion) for name, c, motion in zip(names, cameras, motions, strict=True)}
+    moving = zip(names, cameras, motions, strict=True)
+    return {name: replace(c, motion=motion, duration=duration) for name, c, motion in moving}

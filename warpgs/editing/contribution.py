@@ -50,7 +50,9 @@ def contribution(scene: TrainedScene, cameras: Sequence[Camera], quiet: bool = T
     number = len(scene.scene.static) + len(scene.scene.dynamic)
     total, largest = torch.zeros(2, number, dtype=torch.float32, device=scene.device)
     for camera in progress(cameras, "measuring contributions", quiet):
-        weights = blend_weights_in(scene.splats(camera.time), camera.to(scene.device), scene.config.render_settings)
+        camera = camera.to(scene.device)
+        splats = scene.splats(camera.time, camera=camera)
+        weights = blend_weights_in(splats, camera, scene.config.render_settings)
         total, largest = total + weights, largest.maximum(weights)
     return Contribution(total, largest)
 

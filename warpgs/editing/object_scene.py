@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor, nn
 
+from warpgs.cameras import Camera
 from warpgs.model.gaussians import SH_C0
 from warpgs.model.splats import Splats
 from warpgs.runs.trained import TrainedScene
@@ -36,8 +37,8 @@ class Retimed(NamedTuple):
     freeze: float | None
     shift: float
 
-    def at(self, time: Float[Tensor, "1"]) -> Float[Tensor, "1"]:
-        """The time at which the object is shown at a time of the scene."""
+    def at(self, time: Float[Tensor, " T"]) -> Float[Tensor, " T"]:
+        """The times at which the object is shown at times of the scene."""
         return (time - self.shift).clamp(0.0, 1.0) if self.freeze is None else torch.full_like(time, self.freeze)
 
 
@@ -96,8 +97,8 @@ class ObjectScene(TrainedScene):
     def select(self, kept: Bool[Tensor, " N"]) -> "ObjectScene":
         return ObjectScene(self._plain.select(kept), self.ids[kept], self._retimed, self._recolored)
 
-    def _splats(self, time: Float[Tensor, "1"], residual: bool = True) -> Splats:
-        splats = super()._splats(time, residual)
+    def _splats(self, time: Float[Tensor, "1"], residual: bool = True, camera: Camera | None = None) -> Splats:
+        splats = super()._splats(time, residual, camera)
         assert splats.sh is not None
         sh = splats.sh
         for change, rows in self._rows:
@@ -117,11 +118,12 @@ class RetimedDeformation(nn.Module):
         super().__init__()
         self.deformation, self._rows = deformation, rows
 
-    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, "1"]) -> Float[Tensor, "N 10"]:
+    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, " T"]) -> Float[Tensor, "N 10"]:
         """Offsets, as of the model."""
         offsets = self.deformation(means, time)
         for change, rows in self._rows:
-            offsets = offsets.index_copy(0, rows, self.deformation(means[rows], change.at(time)))
+            at = change.at(time if len(time) == 1 else time[rows])
+            offsets = offsets.index_copy(0, rows, self.deformation(means[rows], at))
         return offsets
 
 

@@ -55,7 +55,8 @@ def alignment(scene: TrainedScene, unit: float, responses: Mapping[int, Response
         if (response := responses.get(camera.id)) is not None:
             truth = truth / response.at(camera.time).to(scene.device)
         region = camera.shown if frame.covisible is None else frame.covisible.to(scene.device)
-        return aligned_camera(scene.splats(camera.time), camera, truth, unit, scene.config.render_settings, region)
+        splats = scene.splats(camera.time, camera=camera)
+        return aligned_camera(splats, camera, truth, unit, scene.config.render_settings, region)
 
     return align
 

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from warpgs.cameras import Camera
 from warpgs.config import ModelConfig
 from warpgs.ops.activation import Changes, activate, join_sh
 from warpgs.runtime.streams import concurrently
@@ -109,7 +110,7 @@ class SplitScene(nn.Module):
         use_deformation: bool = True,
         use_appearance: bool = True,
         sh_degree: int | None = None,
-        time_noise: Float[Tensor, "1"] | None = None,
+        time_noise: Float[Tensor, " T"] | None = None,
         is_hidden: Bool[Tensor, " num_static"] | None = None,
     ) -> Splats:
         """The activated Gaussians at a time, static ones first.
@@ -119,7 +120,8 @@ class SplitScene(nn.Module):
             use_deformation: Whether the deformation network deforms the dynamic Gaussians (paper Eq. 11).
             use_appearance: Whether the appearance network changes the static ones (paper Eq. 8).
             sh_degree: Maximum degree of spherical harmonics to use; all if None. Reflections need all.
-            time_noise: Added to the time that the deformation network sees (annealed smoothing of Deformable-3DGS).
+            time_noise: Added to the time that the deformation network sees, one number or [D] of each dynamic Gaussian
+                (annealed smoothing of Deformable-3DGS, ``with_delays``).
             is_hidden: Static Gaussians from which the appearance network gets no gradient; none if None.
         """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
@@ -141,6 +143,27 @@ class SplitScene(nn.Module):
         quats = splats.quats[len(static) :]
         reflected = reflections(self.light, dynamic.log_scales, quats, dynamic.reflectances)
         return dataclasses.replace(splats, reflections=reflected)
+
+    @torch.no_grad()
+    def with_delays(
+        self, camera: Camera, time: Float[Tensor, "1"], noise: Float[Tensor, "1"] | None = None
+    ) -> Float[Tensor, " T"] | None:
+        """``time_noise`` of ``splats`` so that each dynamic Gaussian is at the time of the row that sees it.
+
+        The row is that of its mean at the time of the middle row, without gradient: one step of a fixed point. With a
+        global shutter it is the noise itself.
+
+        Args:
+            camera: Whose rows see them.
+            time: Time of its middle row.
+            noise: Added to the times of all rows.
+        """
+        means = self.dynamic.means
+        if camera.motion is None or camera.duration == 0.0 or not len(means):
+            return noise
+        offsets = self.deformation(means, time if noise is None else time + noise)
+        delays = camera.delays(means + offsets[:, :3])
+        return delays if noise is None else delays + noise
 
     def static_splats(self, sh_degree: int | None = None) -> Splats:
         """The static Gaussians alone, with their own appearance w⁰."""

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from warpgs.cameras import Camera
 from warpgs.config import Plan
 from warpgs.data.capture import Capture
 from warpgs.formats.cloud import Cloud
@@ -100,7 +101,7 @@ class SceneSequence(TrainedScene):
         """Whether all files have one number of Gaussians, as those of one moving scene do; reads them all."""
         return len({len(read_cloud(file)) for file in self.files}) == 1
 
-    def _splats(self, time: Float[Tensor, "1"], residual: bool = True) -> Splats:
+    def _splats(self, time: Float[Tensor, "1"], residual: bool = True, camera: Camera | None = None) -> Splats:
         index = round(float(time.clamp(0, 1)) * (len(self.files) - 1))
         return dataclasses.replace(self._frame(index).splats(time, False, False), background=self.background)
 

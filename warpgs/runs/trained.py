@@ -106,24 +106,27 @@ class TrainedScene:
         return part
 
     @torch.no_grad()
-    def splats(self, time: float, residual: bool = True) -> Splats:
+    def splats(self, time: float, residual: bool = True, camera: Camera | None = None) -> Splats:
         """The Gaussians at a time in [0, 1], static ones first.
 
         Args:
             time: Time in [0, 1].
             residual: Whether the appearance network changes the static Gaussians (paper Eq. 8).
+            camera: On the scene's device. With a rolling shutter, the dynamic ones are at the times of the rows that
+                see them.
 
         Raises:
             ValueError: If the time is not in [0, 1]: nothing was trained there.
         """
-        return self._splats(self._on_device(time), residual)
+        return self._splats(self._on_device(time), residual, camera)
 
     def _on_device(self, time: float) -> Float[Tensor, "1"]:
         return torch.tensor([require_time(time)], dtype=torch.float32, device=self.device)
 
-    def _splats(self, time: Float[Tensor, "1"], residual: bool = True) -> Splats:
+    def _splats(self, time: Float[Tensor, "1"], residual: bool = True, camera: Camera | None = None) -> Splats:
         flags = self.metadata.use_deformation, self.metadata.use_appearance and residual
-        splats = self.scene.splats(time, *flags, self.metadata.sh_degree)
+        delays = self.scene.with_delays(camera, time) if camera is not None and flags[0] else None
+        splats = self.scene.splats(time, *flags, self.metadata.sh_degree, delays)
         return replace(splats, background=self.background)
 
     def render(
@@ -174,4 +177,4 @@ class TrainedScene:
         self, camera: Camera, time: Float[Tensor, "1"], branches: bool = False, depth: bool = False
     ) -> Rendering:
         settings = replace(self.config.render_settings, branches=branches, depth=depth)
-        return render(self._splats(time), camera, settings=settings)
+        return render(self._splats(time, camera=camera), camera, settings=settings)

@@ -164,7 +164,10 @@ class Step:
         view = self.views.selected()
         flags = (phase.use_deformation, phase.use_appearance)
         is_hidden = self._is_hidden(view) if phase.use_appearance and not self.config.loss.hidden_appearance else None
-        splats = self.scene.splats(view.time, *flags, phase.sh_degree, self._inputs.time_noise, is_hidden)
+        noise = self._inputs.time_noise
+        if phase.use_deformation:
+            noise = self.scene.with_delays(view.camera, view.time, noise)
+        splats = self.scene.splats(view.time, *flags, phase.sh_degree, noise, is_hidden)
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)

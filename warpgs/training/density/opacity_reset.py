@@ -59,7 +59,8 @@ def _compensations(
     found = torch.ones(len(scene.static) + len(scene.dynamic), dtype=torch.float32, device=scene.static.means.device)
     for camera in cameras:
         time = found.new_full((1,), camera.time)
-        splats = scene.splats(time, phase.use_deformation, use_appearance=False)
+        delays = scene.with_delays(camera, time)
+        splats = scene.splats(time, phase.use_deformation, use_appearance=False, time_noise=delays)
         on_screen = opacities_on_screen(splats, camera, settings)
         found = torch.where(on_screen > 0.0, torch.minimum(found, on_screen / splats.opacities), found)
     return found

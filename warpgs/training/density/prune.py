@@ -111,7 +111,8 @@ def blend_weights(
     """
 
     def weights_in(view: View) -> tuple[Tensor]:
-        splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
+        delays = scene.with_delays(view.camera, view.time)
+        splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree, delays)
         return (blend_weights_in(splats, view.camera, settings),)
 
     total = torch.zeros(len(scene.static) + len(scene.dynamic), dtype=torch.float32, device=views.device)

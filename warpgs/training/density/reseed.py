@@ -78,7 +78,8 @@ def lost_pixels(scene: SplitScene, phase: Phase, settings: RenderSettings) -> Ca
 
     @torch.no_grad()
     def mask_of(view: View) -> Bool[Tensor, "H W"]:
-        splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree)
+        delays = scene.with_delays(view.camera, view.time)
+        splats = scene.splats(view.time, phase.use_deformation, phase.use_appearance, phase.sh_degree, delays)
         layer = render(splats, view.camera, settings=settings).dynamic
         assert layer is not None
         lost = ~view.static_mask & (layer.alpha < MAX_LOST_ALPHA)
