@@ -155,9 +155,7 @@ def unproject_pixels(
     Returns:
         The points; None if the masks are empty.
     """
-    chosen: Sequence[int] = range(len(views))
-    if len(views) > MAX_VIEWS:  # at random, so that each camera of several has others
-        chosen = torch.randperm(len(views), generator=generator)[:MAX_VIEWS].sort().values.tolist()
+    chosen = _some_views(len(views), generator)
     num = sum(int(mask_of(view).sum()) for view in views.each(chosen))
     if num == 0:
         return None
@@ -174,6 +172,13 @@ def unproject_pixels(
         found = _unproject(views, chosen, mask_of, estimated, fraction, generator)
     positions, colors, indices = found
     return DynamicPoints(positions, colors, indices, depth_known).chosen(subsample(positions, max_count, generator))
+
+
+def _some_views(num_views: int, generator: torch.Generator) -> Sequence[int]:
+    """At most ``MAX_VIEWS`` views: at random, so that each camera of several has others."""
+    if num_views <= MAX_VIEWS:
+        return range(num_views)
+    return torch.randperm(num_views, generator=generator)[:MAX_VIEWS].sort().values.tolist()
 
 
 def _unproject(
