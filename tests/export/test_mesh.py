@@ -174,7 +174,8 @@ def test_frames_are_ply_files_and_a_shorter_sequence_replaces_a_longer_one(job, 
     ("layers", "names"), [("static", ["static"]), ("dynamic", ["dynamic_00000", "dynamic"])], ids=["static", "dynamic"]
 )
 def test_one_branch_at_one_time_is_a_file_without_the_other(job, tmp_path, layers, names):
-    write_mesh(job(layers=layers, time=0.5, voxel=0.05))
+    summary = write_mesh(job(layers=layers, time=0.5, voxel=0.05))
+    assert ("dynamic ones at 1 time," in summary) == (layers == "dynamic")
     assert [node["name"] for node in document_of(tmp_path / "mesh.glb")["nodes"]] == names
 
 

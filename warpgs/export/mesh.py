@@ -56,8 +56,9 @@ def write_mesh(job: Job) -> str:
     count = sum(len(mesh.faces) for mesh in frames)
     if not count and (static is None or not len(static.faces)):
         raise ValueError(f"{options.run_folder}: no surface is opaque enough for a mesh in the training cameras")
-    shown = f"{0 if static is None else len(static.faces):,} static triangles and {count:,} dynamic ones"
-    summary = f"{shown} at {len(times)} {'time' if len(times) == 1 else 'times'}"
+    summary = f"{0 if static is None else len(static.faces):,} static triangles"
+    if times:
+        summary += f" and {count:,} dynamic ones at {len(times)} {'time' if len(times) == 1 else 'times'}"
     if options.frames is None:
         path = job.file("mesh.glb")
         size = write_mesh_glb(path, static, frames, options.seconds or SECONDS)
