@@ -110,9 +110,10 @@ def load_distortion(distortion: wp.array[float]) -> Distortion:
 
 
 @functools.cache
-def make_project(lens: LensKernels, is_rolling: bool) -> wp.Function:
+def make_project(lens: LensKernels, is_rolling: bool, by_columns: bool) -> wp.Function:
     """Function that projects one Gaussian."""
-    shutter, load_motion, is_wide = make_shutter(lens, is_rolling), make_load_motion(is_rolling), lens.is_wide
+    shutter, is_wide = make_shutter(lens, is_rolling, by_columns), lens.is_wide
+    load_motion = make_load_motion(is_rolling)
 
     @wp.func
     def project(
@@ -191,9 +192,11 @@ def make_project(lens: LensKernels, is_rolling: bool) -> wp.Function:
 
 
 @functools.cache
-def make_project_fwd(num_features: int, with_depth: bool, lens: str = "pinhole", is_rolling: bool = False) -> wp.Kernel:
+def make_project_fwd(
+    num_features: int, with_depth: bool, lens: str = "pinhole", is_rolling: bool = False, by_columns: bool = False
+) -> wp.Kernel:
     """Kernel that projects Gaussians and packs them, one thread for each."""
-    pack_splat, project = make_pack_splat(num_features, with_depth), make_project(LENSES[lens], is_rolling)
+    pack_splat, project = make_pack_splat(num_features, with_depth), make_project(LENSES[lens], is_rolling, by_columns)
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_fwd(
@@ -246,10 +249,12 @@ def make_project_fwd(num_features: int, with_depth: bool, lens: str = "pinhole",
 
 
 @functools.cache
-def make_project_bwd(num_features: int, with_depth: bool, lens: str = "pinhole", is_rolling: bool = False) -> wp.Kernel:
+def make_project_bwd(
+    num_features: int, with_depth: bool, lens: str = "pinhole", is_rolling: bool = False, by_columns: bool = False
+) -> wp.Kernel:
     """Kernel that turns gradient rows into the gradients of the Gaussians, one thread for each."""
     unpack_splat = make_unpack_splat(num_features, with_depth)
-    shutter_sum, load_motion = make_shutter_sum(LENSES[lens], is_rolling), make_load_motion(is_rolling)
+    shutter_sum, load_motion = make_shutter_sum(LENSES[lens], is_rolling, by_columns), make_load_motion(is_rolling)
 
     @wp.kernel(enable_backward=False, module="unique")
     def project_bwd(

@@ -16,7 +16,8 @@ How the image changes with t includes that another row sees it: with J and w at 
 
     J_t = [[1, w_x / (height - w_y)], [0, height / (height - w_y)]] J R(-s Ω)
 
-which shears splats as the shutter does. Above and below the image the motion continues, up to ``MAX_READOUT``.
+which shears splats as the shutter does. Where columns are read one after another, x and width take the places of y and
+height, as in a phone held upright. Above and below the image the motion continues, up to ``MAX_READOUT``.
 R(a) = 1 + f [a] + g [a]², with [a] the matrix of a × and f = sin|a| / |a| and g = (1 - cos|a|) / |a|² as series
 in |a|².
 """
@@ -62,9 +63,9 @@ def make_load_motion(is_rolling: bool) -> wp.Function:
 
 
 @functools.cache
-def make_shutter(lens: LensKernels, is_rolling: bool) -> wp.Function:
+def make_shutter(lens: LensKernels, is_rolling: bool, by_columns: bool) -> wp.Function:
     """Function from a point to its point in the image, the Jacobian and its depth."""
-    return make_rolling_shutter(lens) if is_rolling else make_global_shutter(lens)
+    return make_rolling_shutter(lens, by_columns) if is_rolling else make_global_shutter(lens)
 
 
 def make_global_shutter(lens: LensKernels) -> wp.Function:
@@ -91,9 +92,10 @@ def make_global_shutter(lens: LensKernels) -> wp.Function:
     return global_shutter
 
 
-def make_rolling_shutter(lens: LensKernels) -> wp.Function:
+def make_rolling_shutter(lens: LensKernels, by_columns: bool) -> wp.Function:
     """The lens at the row that sees a point, for Ω = ``turn`` and v = ``move``; depth is 0 beyond its largest angle."""
     lens_point, is_wide = lens.point, lens.is_wide
+    along = 0 if by_columns else 1  # the axis of the image along which lines are read
 
     @wp.func
     def rolling_shutter(
@@ -108,15 +110,17 @@ def make_rolling_shutter(lens: LensKernels) -> wp.Function:
     ):
         middle, middle_jacobian = lens_point(t, focal, center, size, distortion, limit)
         middle_velocity = middle_jacobian * (wp.cross(t, turn) - move)
-        progress = wp.max(1.0 - middle_velocity[1] / size[1], MIN_PROGRESS)
-        s = wp.clamp((middle[1] / size[1] - 0.5) / progress, -MAX_READOUT, MAX_READOUT)
+        progress = wp.max(1.0 - middle_velocity[wp.static(along)] / size[wp.static(along)], MIN_PROGRESS)
+        s = wp.clamp((middle[wp.static(along)] / size[wp.static(along)] - 0.5) / progress, -MAX_READOUT, MAX_READOUT)
 
         rotation = rotation_of(-s * turn)
         at_row = rotation * (t - s * move)
         point, jacobian = lens_point(at_row, focal, center, size, distortion, limit)
         velocity = jacobian * (wp.cross(at_row, turn) - rotation * move)
-        row_progress = wp.max(1.0 - velocity[1] / size[1], MIN_PROGRESS)
+        row_progress = wp.max(1.0 - velocity[wp.static(along)] / size[wp.static(along)], MIN_PROGRESS)
         shear = wp.mat22(1.0, velocity[0] / (size[1] * row_progress), 0.0, 1.0 / row_progress)
+        if wp.static(by_columns):
+            shear = wp.mat22(1.0 / row_progress, 0.0, velocity[1] / (size[0] * row_progress), 1.0)
         depth = at_row[2]
         if wp.static(is_wide):
             distance = wp.length(at_row)
@@ -127,9 +131,9 @@ def make_rolling_shutter(lens: LensKernels) -> wp.Function:
 
 
 @functools.cache
-def make_shutter_sum(lens: LensKernels, is_rolling: bool) -> wp.Function:
+def make_shutter_sum(lens: LensKernels, is_rolling: bool, by_columns: bool) -> wp.Function:
     """Function whose gradient is the backward pass: v_point · point, v_jacobian : J and v_depth · depth."""
-    shutter = make_shutter(lens, is_rolling)
+    shutter = make_shutter(lens, is_rolling, by_columns)
 
     @wp.func
     def shutter_sum(

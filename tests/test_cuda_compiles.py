@@ -51,9 +51,9 @@ def test_the_encoding_compiles(half, tmp_path):
 @pytest.mark.parametrize("make", [make_project_fwd, make_project_bwd])
 @pytest.mark.parametrize("with_depth", [False, True])
 @pytest.mark.parametrize("lens", LENSES)
-@pytest.mark.parametrize("is_rolling", [False, True])
-def test_the_projection_compiles(make, with_depth, lens, is_rolling, tmp_path):
-    assert_compiles(make(3, with_depth, lens, is_rolling).module, tmp_path)
+@pytest.mark.parametrize("shutter", [(False,), (True,), (True, True)])
+def test_the_projection_compiles(make, with_depth, lens, shutter, tmp_path):
+    assert_compiles(make(3, with_depth, lens, *shutter).module, tmp_path)
 
 
 @pytest.mark.parametrize("make", [make_ssim_fwd, make_ssim_bwd])

@@ -66,6 +66,57 @@ def test_points_of_a_row_are_where_the_camera_sees_them_while_it_is_read(lens):
     torch.testing.assert_close(ours, expected)
 
 
+QUARTER_TURN = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""To the left, of what the image shows: the top becomes the left side."""
+
+
+def turned(camera: Camera) -> Camera:
+    """The camera, turned by a quarter, whose image is that of the camera turned to the left."""
+    viewmat, K = camera.viewmat.clone(), camera.K.clone()
+    viewmat[:3] = QUARTER_TURN @ viewmat[:3]
+    K[0, 0], K[1, 1] = camera.K[1, 1], camera.K[0, 0]
+    K[0, 2], K[1, 2] = camera.K[1, 2], camera.width - camera.K[0, 2]
+    motion, size = camera.motion @ QUARTER_TURN.T, {"width": camera.height, "height": camera.width}
+    sign = -1.0 if camera.by_columns else 1.0  # columns read to the right become rows read upwards
+    shutter = {"motion": sign * motion, "duration": sign * camera.duration, "by_columns": not camera.by_columns}
+    return dataclasses.replace(camera, viewmat=viewmat, K=K, **size, **shutter)
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+@LENSES
+def test_an_upright_phone_sees_the_turned_image_of_a_lying_one(lens, turns):
+    images, gradients, delays = [], [], []
+    weights = torch.rand(GLOBAL.height, GLOBAL.width, 3, generator=torch.Generator().manual_seed(0))
+    for k in (0, turns):
+        motion = MOTION.clone().requires_grad_()
+        camera = dataclasses.replace(CAMERAS[lens], motion=motion, duration=0.1)
+        for _ in range(k):
+            camera = turned(camera)
+        splats = dataclasses.replace(make_splats(60), scales=torch.full((60, 3), 0.06))
+        splats = dataclasses.replace(splats, means=splats.means.clone().requires_grad_())
+        image = torch.rot90(render(splats, camera).joint.image, -k)
+        (image * weights).sum().backward()
+        images.append(image.detach())
+        gradients.append((splats.means.grad, motion.grad))
+        delays.append(camera.delays(splats.means).detach())
+    assert relative_error(images[1], images[0]) < 1e-4
+    for of_turned, of_lying in zip(*reversed(gradients), strict=True):
+        assert relative_error(of_turned, of_lying) < 1e-3
+    torch.testing.assert_close(delays[1], delays[0], rtol=1e-4, atol=1e-6)
+
+
+@LENSES
+def test_pixels_of_an_upright_phone_are_seen_there_again(lens):
+    camera = turned(CAMERAS[lens])
+    assert camera.by_columns
+    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    points = camera.unproject(rows.flatten(), columns.flatten(), torch.full((rows.numel(),), 2.0))
+    row, column, _, is_visible = camera.project(points)
+    assert is_visible.all()
+    assert torch.equal(row, rows.flatten())
+    assert torch.equal(column, columns.flatten())
+
+
 @LENSES
 def test_a_gaussian_appears_at_the_pixel_and_depth_that_its_centre_is_projected_to(lens):
     camera = CAMERAS[lens]

@@ -52,6 +52,8 @@ class Camera:
             None for a global shutter.
         duration: With a ``motion``, the time from the first row to the last, in units of ``time``, which is that of the
             middle row; negative if they are read from the last to the first. What moves is seen at its row's time.
+        by_columns: Whether columns, from left to right, take the place of rows in a rolling shutter, as in the upright
+            images of a phone held upright.
         id: Of the device that films. Frames with one id are one video: their neighbours in time show how objects move,
             and they have one exposure and white balance.
 
@@ -68,6 +70,7 @@ class Camera:
     distortion: Distortion | None = None
     motion: Float[Tensor, "2 3"] | None = None
     duration: float = 0.0
+    by_columns: bool = False
     id: int = 0
 
     def __post_init__(self) -> None:
@@ -143,9 +146,14 @@ class Camera:
         s = torch.zeros_like(points[:, 0])
         if self.motion is not None:
             for _ in range(NUM_ROW_STEPS):
-                s = (self.place(in_row)[0][:, 1] / self.height - 0.5).clamp(-MAX_READOUT, MAX_READOUT)
+                s = self._readout(self.place(in_row)[0]).clamp(-MAX_READOUT, MAX_READOUT)
                 in_row = at_row(viewed, self.motion, s)
         return in_row, s
+
+    def _readout(self, positions: Float[Tensor, "P 2"]) -> Float[Tensor, " P"]:
+        """[P] share of the readout from the middle row to the row at positions [px]."""
+        along = 0 if self.by_columns else 1
+        return positions[:, along] / self.size[along] - 0.5
 
     def project(
         self, points: Float[Tensor, "P 3"]
@@ -192,7 +200,7 @@ class Camera:
         positions = torch.stack([column, row], 1).to(depth) + 0.5
         viewed = self.rays(positions) * depth[:, None]
         if self.motion is not None:
-            viewed = at_middle_row(viewed, self.motion, positions[:, 1] / self.height - 0.5)
+            viewed = at_middle_row(viewed, self.motion, self._readout(positions))
         return (viewed - self.viewmat[:3, 3]) @ self.viewmat[:3, :3]
 
     def rays(self, positions: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:

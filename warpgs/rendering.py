@@ -80,6 +80,7 @@ class _Request(NamedTuple):
 
     size: tuple[int, int]
     lens: tuple[float, str]
+    by_columns: bool
     settings: RenderSettings
     num_features: int
     sh_degree: int | None
@@ -209,6 +210,7 @@ def opacities_on_screen(splats: Splats, camera: Camera, settings: RenderSettings
     """[N] opacities with which ``render`` composites splats: with ``antialias`` compensated, of culled ones 0."""
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
     view = View(camera.viewmat, camera.K, *camera.size, _coefficients(camera), *_lens(camera), camera.motion)
+    view = view._replace(by_columns=camera.by_columns)
     rows, *_ = project_fwd(geometry, splats.means, view, settings.near, settings.antialias, with_depth=False)
     return rows.opacities
 
@@ -217,7 +219,7 @@ def _request(splats: Splats, camera: Camera, settings: RenderSettings) -> _Reque
     degree = None
     if splats.sh is not None:
         degree = degree_of(splats.sh.shape[1]) if splats.sh_degree is None else splats.sh_degree
-    return _Request(camera.size, _lens(camera), settings, splats.num_channels, degree)
+    return _Request(camera.size, _lens(camera), camera.by_columns, settings, splats.num_channels, degree)
 
 
 def _lens(camera: Camera) -> tuple[float, str]:
@@ -230,7 +232,8 @@ def _coefficients(camera: Camera) -> Tensor | None:
 
 
 def _view(tensors: _Inputs | _Saved, request: _Request) -> View:
-    return View(tensors.viewmat, tensors.K, *request.size, tensors.distortion, *request.lens, tensors.motion)
+    view = View(tensors.viewmat, tensors.K, *request.size, tensors.distortion, *request.lens, tensors.motion)
+    return view._replace(by_columns=request.by_columns)
 
 
 def _inputs(
@@ -278,7 +281,7 @@ def _check_inputs(
 
 def _forward(request: _Request, *tensors: Any) -> Recorded:
     """(color →) project → bin → composite; every differentiable step records its backward function on one tape."""
-    inputs, (size, _, settings, _, sh_degree) = _Inputs._make(tensors), request
+    inputs, (size, _, _, settings, _, sh_degree) = _Inputs._make(tensors), request
     geometry, view = Geometry(*inputs[:4]), _view(inputs, request)
     back, tape = _Backward(request, _has_gradient(inputs.screen_offsets)), Tape()
 

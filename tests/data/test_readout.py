@@ -140,3 +140,27 @@ def test_an_imported_capture_keeps_its_readout(tmp_path):
     edit_json(root / "dataset.json", readout=0.6)
     import_capture(root, tmp_path / "copy")
     assert load_capture(tmp_path / "copy").readout == 0.6
+
+
+@pytest.mark.parametrize(
+    ("side", "sign", "by_columns"), [("top", 1, False), ("bottom", -1, False), ("left", 1, True), ("right", -1, True)]
+)
+def test_the_side_where_a_readout_begins_is_in_the_files_and_an_option(side, sign, by_columns, tmp_path):
+    root = write_capture(tmp_path / "capture", "nerfds")
+    asked = open_capture(TrainConfig(data=root, readout=0.6, readout_from=side))
+    edit_json(root / "dataset.json", readout=0.6, readout_from=side)
+    import_capture(root, tmp_path / "copy")
+    downward = open_capture(TrainConfig(data=root, readout_from="top"))
+    for capture in (asked, load_capture(root), load_capture(tmp_path / "copy")):
+        assert (capture.readout, capture.readout_from) == (0.6, side)
+        for name in capture.train:
+            camera, plain = capture.cameras[name], downward.cameras[name]
+            assert camera.by_columns is by_columns
+            assert camera.duration == pytest.approx(sign * plain.duration)
+            torch.testing.assert_close(camera.motion, sign * plain.motion, rtol=1e-3, atol=1e-5)
+
+
+def test_a_side_that_there_is_not_is_refused(tmp_path):
+    root = write_capture(tmp_path / "capture", "nerfds")
+    edit_json(root / "dataset.json", readout_from="above")
+    refused(root, "dataset.json: readout_from must be one of top, bottom, left, right, got 'above'")

@@ -11,7 +11,8 @@ from warpgs.captures.opening import load_capture
 from warpgs.data.lens import Lens
 from warpgs.data.loaders import recognize
 from warpgs.prepare.cameras.recovered import Cameras
-from warpgs.prepare.scene import are_static, scene_units, write_frames, write_scene
+from warpgs.prepare.frames.take import Frames, SourceFrame
+from warpgs.prepare.scene import are_static, scene_units, write_capture, write_frames, write_scene
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +87,22 @@ def test_frames_and_masks_are_written_as_they_were_recorded_with_their_lens(mode
     found = Lens.of(frame.camera)
     assert (found.focal, found.model) == (pytest.approx(lens.focal), model)
     assert found.coefficients == pytest.approx((0.05, -0.01))
+
+
+@pytest.mark.parametrize(
+    ("sides", "written", "is_noted"),
+    [(["left"], "left", False), (["top"], "top", False), (["left", "top"], "top", True)],
+)
+def test_the_side_where_the_readout_of_rotated_videos_begins_is_written(sides, written, is_noted, tmp_path):
+    images, masks = boards.record(6)
+    folder = boards.write_folder(tmp_path / "frames", images)
+    names = [path.stem for path in sorted(folder.iterdir())]
+    taken = [SourceFrame(name, name, k, k) for k, name in enumerate(names)]
+    videos = [Frames(folder, taken, *boards.SIZE, 1.0, readout_from=side) for side in sides]
+    cameras = [boards.true_cameras(folder, names)]
+    _, notes = write_capture(tmp_path / "made", videos, cameras, lambda _: masks, estimated=False, val=[])
+    assert load_capture(tmp_path / "made").readout_from == written
+    assert any("begins at the left, top of their" in note for note in notes) == is_noted
 
 
 def test_points_in_dynamic_regions_are_omitted():

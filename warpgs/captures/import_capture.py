@@ -133,6 +133,7 @@ def _write_index(folder: Path, capture: Capture, names: list[str], val: list[str
         {name: camera.id for name, camera in cameras.items()},
         estimated_masks=capture.estimated_masks,
         readout=capture.readout,
+        readout_from=capture.readout_from,
     )
 
 

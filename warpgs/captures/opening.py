@@ -67,7 +67,12 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
         root = builtin_capture(device=torch.device(config.device or "cpu"), quiet=quiet)
     damage = MaskPerturbation.parse(config.damage_masks)
     options = LoadOptions(
-        config.factor, damage, distortion=config.distortion, depth=config.depth, readout=config.readout
+        config.factor,
+        damage,
+        distortion=config.distortion,
+        depth=config.depth,
+        readout=config.readout,
+        readout_from=config.readout_from,
     )
     capture = load_with(root, config.dataset, options)
     capture.is_builtin = config.data is None or is_builtin(config.data)

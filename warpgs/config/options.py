@@ -41,8 +41,10 @@ class TrainConfig:
     (vrig) have a factor of 4."""
     readout: Annotated[float | None, Bounds(min=-1, max=1)] = None
     """Rolling shutter: time in which the rows of a frame are read from top to bottom, as a part of the time between two
-    frames; negative from bottom to top. That of the capture's files if omitted, 0 (global shutter) without any. Not for
-    a phone's portrait videos, whose columns are read one after another."""
+    frames; negative from bottom to top. That of the capture's files if omitted, 0 (global shutter) without any."""
+    readout_from: Literal["top", "bottom", "left", "right"] | None = None
+    """Side of the images at which a positive readout begins: left or right in portrait videos of phones. That of the
+    capture's files if omitted, to which prepare writes how a video was rotated; top without any."""
     out: Path | None = None
     """Run folder; runs/<capture>-<preset> if omitted, with the suffix -2, -3 … if that exists."""
     resume: Path | None = None

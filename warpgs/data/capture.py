@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -38,6 +38,11 @@ MAX_CACHE_BYTES = 1 << 30
 FRAME_BYTES_PER_PIXEL = 3 + 1 + 4
 """Memory of a cached frame per pixel [bytes]: 8-bit RGB, a mask and depth in single precision."""
 
+
+Side = Literal["top", "bottom", "left", "right"]
+"""A side of an image."""
+
+SIDES: tuple[Side, ...] = get_args(Side)
 
 Assumption = Literal["masks", "static", "dynamic"]
 """What is taken as dynamic: the region that the masks mark, nothing, or everything."""
@@ -132,6 +137,8 @@ class Capture:
         time_source: Where the times of the cameras come from.
         readout: Time in which the rows of a frame are read from the first to the last, as a part of the median time
             between training frames; negative from the last to the first, 0 with a global shutter. See ``with_readout``.
+        readout_from: Side of the images at which a positive readout begins: of upright images of a phone held upright
+            it is the left or the right one, and columns are read one after another.
         layout: Name of the layout of its files, for the middle of messages; empty if it was not read from files.
         unmasked: What "masks" means for this capture: "dynamic" if it has no masks because everything moves.
         conventions: What its files mean.
@@ -162,6 +169,7 @@ class Capture:
     notes: Sequence[str] = ()
     time_source: TimeSource = AS_GIVEN
     readout: float = 0.0
+    readout_from: Side = "top"
     layout: str = ""
     tracks: Tracks | None = None
     metres: float | None = None

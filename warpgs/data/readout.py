@@ -10,34 +10,38 @@ from scipy.interpolate import CubicSpline
 
 from warpgs.cameras import Camera
 
-from .capture import Capture
+from .capture import SIDES, Capture, Side
 
 
-def with_readout(capture: Capture, readout: float) -> Capture:
+def with_readout(capture: Capture, readout: float, begins: Side = "top") -> Capture:
     """The same capture with cameras in motion, at the speed of a spline through the poses of each camera's frames.
 
     Args:
         capture: With poses of the middle rows.
-        readout: See ``Capture.readout``.
+        readout, begins: See ``Capture.readout`` and ``readout_from``.
 
     Raises:
-        ValueError: If it is not a number from -1 to 1, or a camera has fewer than two frames or two at one time; the
-            message names them.
+        ValueError: If it is not a number from -1 to 1, there is no such side, or a camera has fewer than two frames or
+            two at one time; the message names them.
     """
     if not abs(readout) <= 1.0:
         raise ValueError(
             f"readout must be a number from -1 to 1, as a frame is read before the next one begins, got {readout}"
         )
-    moved = capture.with_cameras(_in_motion(capture, readout) if readout else {})
-    moved.readout = readout
+    if begins not in SIDES:
+        raise ValueError(f"readout_from must be one of {', '.join(SIDES)}, got {begins!r}")
+    signed, by_columns = (readout if begins in ("top", "left") else -readout), begins in ("left", "right")
+    moved = capture.with_cameras(_in_motion(capture, signed, by_columns) if readout else {})
+    moved.readout, moved.readout_from = readout, begins
     return moved
 
 
-def _in_motion(capture: Capture, readout: float) -> dict[str, Camera]:
+def _in_motion(capture: Capture, readout: float, by_columns: bool) -> dict[str, Camera]:
     videos = [*capture.by_camera((*capture.train, *capture.val)).values()]
     _check(capture, videos)
     duration = readout * capture.interval
-    return {name: camera for video in videos for name, camera in _moving(capture, video, duration).items()}
+    moving = {name: camera for video in videos for name, camera in _moving(capture, video, duration).items()}
+    return {name: replace(camera, by_columns=by_columns) for name, camera in moving.items()}
 
 
 def _check(capture: Capture, videos: Sequence[Sequence[str]]) -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 
 from warpgs.files import write_array, write_json, write_png
 
+from .capture import Side
 from .lens import Lens
 from .units import SceneUnits
 
@@ -213,6 +214,7 @@ def write_index(
     *,
     estimated_masks: bool = False,
     readout: float = 0.0,
+    readout_from: Side = "top",
 ) -> None:
     """Writes metadata.json, then dataset.json, which makes the folder a capture.
 
@@ -225,7 +227,7 @@ def write_index(
         val: Frames to evaluate on; all others are trained on.
         camera_ids: Camera of every frame; all are camera 0 if None.
         estimated_masks: Whether the masks are estimates, see ``Capture.estimated_masks``.
-        readout: See ``Capture.readout``.
+        readout, readout_from: See ``Capture``.
     """
     are_steps = all(time >= 0 and float(time).is_integer() for time in times.values())
     steps = (
@@ -240,7 +242,8 @@ def write_index(
     train_ids, val_ids = ([name for name in times if (name in val) == held_out] for held_out in (False, True))
     counts = {"count": len(times), "num_exemplars": len(train_ids)}
     splits = {"ids": [*times], "train_ids": train_ids, "val_ids": val_ids}
-    others = ({"masks": ESTIMATED} if estimated_masks else {}) | ({"readout": readout} if readout else {})
+    shutter = {"readout": readout or None, "readout_from": None if readout_from == "top" else readout_from}
+    others = {k: v for k, v in {"masks": ESTIMATED if estimated_masks else None, **shutter}.items() if v is not None}
     write_json(root / "dataset.json", {**counts, "layout": LAYOUT, **others, **splits})
 
 

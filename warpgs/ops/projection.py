@@ -41,6 +41,7 @@ class View(NamedTuple):
         lens: Name of the lens, a key of ``kernels.lenses.LENSES``.
         motion: [2, 3] how the camera turns (rotation vector [radians]) and moves while its rows are read from first to
             last, in its own axes; ``viewmat`` is at the middle row then. None for a global shutter.
+        by_columns: Whether columns take the place of rows in ``motion``.
     """
 
     viewmat: Float[Tensor, "4 4"]
@@ -51,6 +52,7 @@ class View(NamedTuple):
     limit: float = 0.0
     lens: str = "pinhole"
     motion: Float[Tensor, "2 3"] | None = None
+    by_columns: bool = False
 
     @property
     def arguments(self) -> tuple[Tensor | int | float | None, ...]:
@@ -58,9 +60,10 @@ class View(NamedTuple):
         return (*self[:6], self.motion)
 
     @property
-    def variant(self) -> tuple[str, bool]:
+    def variant(self) -> tuple[str, bool, bool]:
         """Of the kernels: lens and shutter."""
-        return self.lens, self.motion is not None
+        is_rolling = self.motion is not None
+        return self.lens, is_rolling, is_rolling and self.by_columns
 
 
 class SplatGradients(NamedTuple):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from warpgs.captures.findings import few_of
 from warpgs.command_line.progress import progress
 from warpgs.data import writer
+from warpgs.data.capture import Side
 from warpgs.data.units import depth_range, scene_units
 
 from .cameras.recovered import Cameras, camera_centers
@@ -33,6 +35,12 @@ Masks = Sequence[Bool[np.ndarray, "H W"]]
 NO_PARALLAX = (
     "the camera stays at one place: nothing tells how far away surfaces are, so the points lie on a sphere around it "
     "(unless a network estimates depth), and views from elsewhere are guesses"
+)
+
+
+SEVERAL_SIDES = (
+    "the videos were filmed with the phones held differently: a rolling shutter (--readout) begins at the {} of their "
+    "images, but --readout-from is one side for all"
 )
 
 
@@ -71,9 +79,18 @@ def write_capture(
         shown = write_frames(root, videos[0].folder, camera, dynamic, chosen, quiet)
         sheets.append(_painted(camera.names, shown, dynamic))
     times = {frame.name: frame.time for video in videos for frame in video.taken}
-    write_scene(root, cameras, points, times, val, estimated)
+    write_scene(root, cameras, points, times, val, estimated, _common_side(videos, notes))
     write_contact_sheet(root / "masks.png", sheets)
     return f"{len(times) - len(omitted)} frames, {len(omitted)} omitted, {len(points)} static points", notes
+
+
+def _common_side(videos: Sequence[Frames], notes: list[str]) -> Side:
+    """``Frames.readout_from`` of all videos; the top, and a note for the user, if they differ."""
+    sides = {video.readout_from for video in videos}
+    if len(sides) > 1:
+        notes.append(SEVERAL_SIDES.format(", ".join(sorted(sides))))
+        return "top"
+    return sides.pop()
 
 
 def _omitted(videos: Sequence[Frames], cameras: Sequence[Cameras]) -> list[str]:
@@ -181,6 +198,7 @@ def write_scene(
     times: dict[str, int],
     val: Collection[str] = (),
     estimated_masks: bool = False,
+    readout_from: Side = "top",
 ) -> None:
     """Writes points.npy, scene.json, metadata.json, and finally dataset.json, which makes the folder a capture.
 
@@ -191,6 +209,7 @@ def write_scene(
         times: Time of each frame, see ``SourceFrame``.
         val: Names of the frames for evaluation.
         estimated_masks: Whether the masks are estimates.
+        readout_from: See ``Capture.readout_from``.
 
     Raises:
         OSError: If a file cannot be written; the message names it.
@@ -199,7 +218,8 @@ def write_scene(
     first = min(times[camera.names[0]] for camera in cameras)
     time_ids = {name: times[name] - first for camera in cameras for name in camera.names}
     camera_ids = {name: k for k, camera in enumerate(cameras) for name in camera.names}
-    writer.write_index(root, time_ids, val, camera_ids, estimated_masks=estimated_masks)
+    others: dict[str, Any] = {"estimated_masks": estimated_masks, "readout_from": readout_from}
+    writer.write_index(root, time_ids, val, camera_ids, **others)
 
 
 def write_world(root: Path, points: Float[np.ndarray, "P 3"], poses: Float[np.ndarray, "F 3 4"]) -> None:

@@ -118,6 +118,7 @@ FORMER: dict[str, dict[str, Any]] = {
         "out": None,
         "preset": None,
         "readout": None,
+        "readout_from": None,
         "resume": None,
     },
     "densify": {

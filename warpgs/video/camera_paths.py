@@ -323,6 +323,6 @@ def filling(camera: Camera, size: tuple[int, int]) -> Camera:
     K = scaled.K.clone()
     K[0, 2] -= (scaled.width - width) // 2
     K[1, 2] -= (scaled.height - height) // 2
-    left = height / scaled.height  # of the rows
+    left = width / scaled.width if camera.by_columns else height / scaled.height  # of what is read one after another
     motion, duration = None if camera.motion is None else camera.motion * left, camera.duration * left
     return dataclasses.replace(camera, K=K, width=width, height=height, motion=motion, duration=duration)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Int64
@@ -35,16 +36,16 @@ class StackedCameras:
         motions = [still if camera.motion is None else camera.motion for camera in cameras]
         have_motion = any(camera.motion is not None for camera in cameras)
         self._motions = torch.stack(motions).to(device) if have_motion else None
-        self._durations = [camera.duration for camera in cameras]
+        self._readouts = [(camera.duration, camera.by_columns) for camera in cameras]
 
     @property
     def have_one_lens(self) -> bool:
-        """Whether all lenses are of one kind and limit, show the same pixels and are read in one time.
+        """Whether all lenses are of one kind and limit, show the same pixels and are read in one way.
 
         These are constants of a CUDA graph.
         """
         kinds = {None if lens is None else (lens.lens, lens.limit) for lens in self.lenses}
-        return len(kinds) == len({id(mask) for mask in self.shown}) == len({*self._durations}) == 1
+        return len(kinds) == len({id(mask) for mask in self.shown}) == len({*self._readouts}) == 1
 
     def at(self, index: Int64[Tensor, "1"], number: int, size: tuple[int, int]) -> Camera:
         """The camera of an index on the device, at time 0.
@@ -58,7 +59,9 @@ class StackedCameras:
         viewmat, K, k = (values.index_select(0, index)[0] for values in of_cameras)
         distortion = None if lens is None else replace(lens, coefficients=k[: len(lens.coefficients)])
         motion = None if self._motions is None else self._motions.index_select(0, index)[0]
-        return Camera(viewmat, K, *size, distortion=distortion, motion=motion, duration=self._durations[number])
+        duration, by_columns = self._readouts[number]
+        shutter: dict[str, Any] = {"motion": motion, "duration": duration, "by_columns": by_columns}
+        return Camera(viewmat, K, *size, distortion=distortion, **shutter)
 
 
 def _shown(cameras: Sequence[Camera], device: torch.device) -> list[Bool[Tensor, "H W"] | None]:

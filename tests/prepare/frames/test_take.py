@@ -103,6 +103,27 @@ def test_an_image_is_rotated_by_its_orientation_tag(tmp_path, images):
     assert decode(tmp_path / "frames/frame_000000.png").shape[:2] == images[0].shape[1::-1]
 
 
+@pytest.mark.parametrize(
+    ("turn", "side"), [((0, 1, -1, 0), "right"), ((-1, 0, 0, -1), "bottom"), ((0, -1, 1, 0), "left"), (None, "top")]
+)
+def test_a_rotation_tag_says_where_the_first_row_of_the_sensor_is(turn, side, tmp_path, images):
+    bright = [image.copy() for image in images[:8]]
+    for image in bright:
+        image[: image.shape[0] // 4] = 255
+    data = write_video(tmp_path / "video.mp4", bright).read_bytes()
+    if turn is not None:
+        a, b, c, d = (entry * (1 << 16) for entry in turn)
+        track = data.index(b"tkhd")
+        lying = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+        data = data[:track] + data[track:].replace(lying, struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30), 1)
+    (tmp_path / "tagged.mp4").write_bytes(data)
+    frames = take_frames(tmp_path / "tagged.mp4", tmp_path / "frames", Selection())
+    assert Frames.load(tmp_path / "frames").readout_from == frames.readout_from == side
+    image = decode(tmp_path / "frames/frame_000000.png").astype(float)
+    edges = {"top": image[:8], "bottom": image[-8:], "left": image[:, :8], "right": image[:, -8:]}
+    assert max(edges, key=lambda edge: edges[edge].mean()) == side
+
+
 def test_a_video_is_rotated_by_its_rotation_tag(tmp_path, images):
     data = write_video(tmp_path / "video.mp4", images[:8]).read_bytes()
     track = data.index(b"tkhd")

@@ -98,7 +98,8 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     capture.layout = describe_layout(root, layout, dataset)
     capture.tracks = read_tracks(root, capture.film)
     try:
-        return with_readout(capture, capture.readout if options.readout is None else options.readout)
+        readout = capture.readout if options.readout is None else options.readout
+        return with_readout(capture, readout, options.readout_from or capture.readout_from)
     except ValueError as error:
         raise ValueError(f"{root}: {error}") from error
 

@@ -21,7 +21,7 @@ from warpgs.cameras import Camera
 from warpgs.config import MaskPerturbation
 from warpgs.data import images
 from warpgs.data.camera_files import read_camera
-from warpgs.data.capture import Capture, Frame
+from warpgs.data.capture import SIDES, Capture, Frame, Side
 from warpgs.data.lens import Lens
 from warpgs.data.masks import perturb
 from warpgs.data.points import read_points
@@ -115,6 +115,7 @@ class NerfiesLoader(ABC):
             estimated_masks=_are_estimates(root / "dataset.json", dataset) and any(f.mask for f in files.values()),
             time_source=time_source,
             readout=float(read_numbers(root / "dataset.json", {"readout": 0.0, **dataset}, "readout", ())),
+            readout_from=_side(root / "dataset.json", dataset),
             notes=[
                 *turning_notes([files[name].image for name in cameras], [camera.size for camera in cameras.values()]),
                 *skipped_images(root, (file.image for file in files.values()), listed),
@@ -126,6 +127,14 @@ def _read_depth(
     loader: NerfiesLoader, units: SceneUnits, path: Path, size: tuple[int, int], image: Path
 ) -> Float[np.ndarray, "H W"]:
     return loader.inverse_depth(path, size, units, image)
+
+
+def _side(path: Path, dataset: dict[str, Any]) -> Side:
+    """``Capture.readout_from`` of dataset.json; raises ValueError if it is no side."""
+    side = dataset.get("readout_from", "top")
+    if side not in SIDES:
+        raise ValueError(f"{path}: readout_from must be one of {', '.join(SIDES)}, got {reprlib.repr(side)}")
+    return side
 
 
 def _are_estimates(path: Path, dataset: dict[str, Any]) -> bool:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from warpgs.config import MaskPerturbation
+from warpgs.data.capture import Side
 
 
 @dataclass(frozen=True)
@@ -11,6 +12,7 @@ class LoadOptions:
 
     Attributes:
         factor, perturbation, cache_frames, distortion, readout: Arguments of ``load_capture``.
+        readout_from: See ``Capture.readout_from``; that of the capture's files if None.
         depth: Whether to read depth. Without it the capture is the same as one whose files have none: it has no points
             that are unprojected from depth either.
     """
@@ -21,3 +23,4 @@ class LoadOptions:
     distortion: bool = True
     depth: bool = True
     readout: float | None = None
+    readout_from: Side | None = None

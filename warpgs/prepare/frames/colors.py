@@ -61,7 +61,12 @@ def to_rgb(frame: Any, transfer: int, longest_side: int) -> UInt8[np.ndarray, "H
         format="rgb48le" if deep else "rgb24", src_colorspace=matrix, dst_color_range=FULL_RANGE
     ).to_ndarray()
     rgb = srgb_from_hdr(resize_to_side(converted, longest_side, 1.0), transfer) if deep else converted
-    return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90)))
+    return np.ascontiguousarray(np.rot90(rgb, quarter_turns(frame)))
+
+
+def quarter_turns(frame: Any) -> int:
+    """By how many quarter turns to the left the display matrix of PyAV's frame rotates it."""
+    return round(frame.rotation / 90)
 
 
 def srgb_from_hdr(encoded: UInt16[np.ndarray, "H W 3"], transfer: int) -> UInt8[np.ndarray, "H W 3"]:

@@ -4,12 +4,14 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.command_line.progress import progress
+from warpgs.data.capture import SIDES, Side
 from warpgs.data.images import MAX_SIDE, decode
 from warpgs.data.loaders.name_times import times_of_names
 from warpgs.data.optical_flow import MAX_ASPECT, MIN_SIDE
@@ -67,6 +69,7 @@ class Frames:
         factor: Their size over that of the source.
         source: The video or folder, for messages.
         is_still: Whether the camera is one of several and stands still; then ``background`` is a file, too.
+        readout_from: See ``Capture.readout_from``.
     """
 
     folder: Path
@@ -76,6 +79,7 @@ class Frames:
     factor: float
     source: str = ""
     is_still: bool = False
+    readout_from: Side = "top"
 
     @staticmethod
     def load(folder: Path, prefix: str = PREFIX) -> "Frames":
@@ -83,7 +87,8 @@ class Frames:
         index = read_json(index_of(folder, prefix))
         taken = [SourceFrame(str(f["name"]), str(f["source"]), int(f["step"]), int(f["time"])) for f in index["frames"]]
         size = int(index["width"]), int(index["height"]), float(index["factor"])
-        return Frames(folder, taken, *size, str(index["source"]), bool(index["is_still"]))
+        others = str(index["source"]), bool(index["is_still"]), _side(index)
+        return Frames(folder, taken, *size, *others)
 
     @staticmethod
     def load_all(folder: Path) -> list["Frames"]:
@@ -133,6 +138,13 @@ class Frames:
     def megabytes(self, bytes_per_pixel: int) -> int:
         """Disk space for this number of bytes per pixel of all frames, rounded up [MB]."""
         return len(self.taken) * self.width * self.height * bytes_per_pixel // 1_000_000 + 1
+
+
+def _side(index: dict[str, Any]) -> Side:
+    side = index.get("readout_from", "top")
+    if side not in SIDES:
+        raise ValueError(f"readout_from must be one of {', '.join(SIDES)}, got {side!r}")
+    return side
 
 
 def check_selection(selection: Selection) -> None:
@@ -197,7 +209,8 @@ def take_frames(
             f"{source} gives {len(taken)} frame{'s' * (len(taken) != 1)}, at least {MIN_FRAMES} are needed"
         )
     height, width = image.shape[:2]
-    frames = Frames(folder, taken, width, height, max(width, height) / found.longest_side, str(source))
+    size, factor = (width, height), max(width, height) / found.longest_side
+    frames = Frames(folder, taken, *size, factor, str(source), readout_from=found.readout_from)
     frames.save()
     return frames
 

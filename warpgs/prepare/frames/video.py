@@ -12,13 +12,14 @@ import numpy as np
 from jaxtyping import UInt8
 
 from warpgs.command_line.progress import progress
+from warpgs.data.capture import Side
 from warpgs.data.images import MAX_PIXELS, MAX_SIDE
 from warpgs.data.resized import size_within
 from warpgs.data.video_frames import READ_LOCAL_FILES
 from warpgs.files import require_file
 
 from ..options import Selection
-from .colors import to_rgb
+from .colors import quarter_turns, to_rgb
 from .cuts import CutFinder
 from .images import SHARPNESS_SIDE, grey_sharpness
 from .timeline import Timeline, plan_timeline
@@ -33,6 +34,10 @@ MAX_COUNTED = 1_000_000
 """Maximum number of frames of a video; later ones are ignored."""
 
 
+TURNED_TOP: tuple[Side, ...] = ("top", "left", "bottom", "right")
+"""Where the top of a frame is after a number of quarter turns to the left."""
+
+
 class TakenImage(NamedTuple):
     """A frame of a video or a folder.
 
@@ -42,6 +47,7 @@ class TakenImage(NamedTuple):
         origin: Its origin, for messages.
         image: [H, W, 3] RGB.
         longest_side: Longer side of the frame in the source [px].
+        readout_from: Side where the first row of the sensor is, the top before the frame was rotated.
     """
 
     step: int
@@ -49,6 +55,7 @@ class TakenImage(NamedTuple):
     origin: str
     image: UInt8[np.ndarray, "H W 3"]
     longest_side: int
+    readout_from: Side = "top"
 
 
 def read_video(source: Path, selection: Selection, quiet: bool, notes: list[str]) -> Iterator[TakenImage]:
@@ -92,7 +99,8 @@ def read_video(source: Path, selection: Selection, quiet: bool, notes: list[str]
 def _taken(time: Fraction, frame: Any, stream: Any, timeline: Timeline, selection: Selection) -> TakenImage:
     image = to_rgb(frame, int(stream.codec_context.color_trc or 0), selection.longest_side)
     step = timeline.steps[time]
-    return TakenImage(step, round(1000 * time), f"frame {step}", image, max(frame.width, frame.height))
+    side = TURNED_TOP[quarter_turns(frame) % 4]
+    return TakenImage(step, round(1000 * time), f"frame {step}", image, max(frame.width, frame.height), side)
 
 
 def _grey(frame: Any) -> UInt8[np.ndarray, "h w"]:
