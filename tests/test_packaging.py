@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
@@ -53,6 +54,15 @@ CHECKERS = {"mypy", "ruff"}
 def release(version):
     """The first three numbers of a version; OpenCV has a fourth, of the package alone."""
     return (*Version(version).release, 0, 0)[:3]
+
+
+def test_the_package_index_shows_the_pythons_that_are_accepted(project):
+    shown = [c.rpartition(" ")[2] for c in project["project"]["classifiers"] if ":: Python :: 3." in c]
+    accepted = SpecifierSet(project["project"]["requires-python"])
+    assert shown
+    assert all(version in accepted for version in shown)
+    assert "3.9" not in accepted
+    assert shown[0] == project["tool"]["mypy"]["python_version"]
 
 
 def test_python_3_10_gets_the_parser_of_toml_that_sweep_imports(project):
