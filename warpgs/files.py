@@ -134,6 +134,8 @@ def complete_or_absent(folder: Path, keep_existing: bool = False) -> Iterator[Pa
             partial.mkdir()
             yield partial
             try:
+                with suppress(OSError):  # Windows renames to nothing that exists
+                    folder.rmdir()
                 partial.rename(folder)
             except OSError:
                 if not (keep_existing and folder.is_dir()):

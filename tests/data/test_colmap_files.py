@@ -3,6 +3,7 @@
 import os
 import shutil
 import struct
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -43,6 +44,15 @@ def overwrite(path, offset, data):
 def test_binary_and_text_models_are_read_in_full(written, kind):
     model = read_model(written / kind)
     assert (len(model.cameras), len(model.images), len(model.points3D)) == (2, 6, 20)
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_a_model_is_read_where_links_need_rights(written, kind, monkeypatch):
+    def refuse(link, target):
+        raise PermissionError(1314, "a required privilege is not held by the client", str(link))
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    assert len(read_model(written / kind).images) == 6
 
 
 @pytest.mark.parametrize("name", BINARY)

@@ -14,6 +14,7 @@ file until memory is exhausted. So the sizes of all entries are added up first. 
 from __future__ import annotations
 
 import reprlib
+import shutil
 import struct
 import tempfile
 from collections.abc import Callable
@@ -91,6 +92,14 @@ def _suffix(folder: Path) -> str:
     return suffix
 
 
+def _lend(file: Path, path: Path) -> None:
+    """A link to a file; a copy where links need rights that users do not have, as on Windows."""
+    try:
+        path.symlink_to(file)
+    except OSError:
+        shutil.copyfile(file, path)
+
+
 def _opened(folder: Path, suffix: str, names: list[str], note: Callable[[str], None]) -> pycolmap.Reconstruction:
     """The model of some files of a folder."""
     import pycolmap  # takes 0.2 s
@@ -98,7 +107,7 @@ def _opened(folder: Path, suffix: str, names: list[str], note: Callable[[str], N
     with tempfile.TemporaryDirectory() as temporary:
         copy = Path(temporary)
         for name in names:  # COLMAP would read others that it finds in the folder
-            (copy / (name + suffix)).symlink_to((folder / (name + suffix)).resolve())
+            _lend((folder / (name + suffix)).resolve(), copy / (name + suffix))
         try:
             if suffix == ".bin" or not lacks_features(folder):
                 return pycolmap.Reconstruction(str(copy))
