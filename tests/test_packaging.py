@@ -65,6 +65,22 @@ def test_the_package_index_shows_the_pythons_that_are_accepted(project):
     assert shown[0] == project["tool"]["mypy"]["python_version"]
 
 
+def test_the_image_has_no_build_tools_and_no_root():
+    """Its caches lie in its volume, which is also where its runs go."""
+    text = re.sub(r"^#.*\n", "", (ROOT / "Dockerfile").read_text(), flags=re.MULTILINE).replace("\\\n", " ")
+    build, image = re.split(r"^FROM ", text, flags=re.MULTILINE)[1:]
+    assert "pip install" in build and "pip install" not in image
+    steps = [line.split(maxsplit=1) for line in image.splitlines()[1:] if line]
+    values = dict(step for step in steps if step[0] != "ENV")
+    variables = dict(v.split("=", 1) for name, value in steps if name == "ENV" for v in value.split())
+    assert values["USER"] not in ("root", "0")
+    assert values["WORKDIR"] == values["VOLUME"]
+    assert all(variables[name].startswith(values["VOLUME"]) for name in ("WARP_CACHE_PATH", "XDG_CACHE_HOME"))
+    assert f"install -d -o {values['USER']} {values['VOLUME']}" in values["RUN"]
+    copied = re.findall(r"^COPY (?!--from)(\S+)", text, re.MULTILINE)
+    assert all((ROOT / name).exists() for name in copied)
+
+
 def test_python_3_10_gets_the_parser_of_toml_that_sweep_imports(project):
     markers = {r.name: r.marker for r in map(Requirement, project["project"]["dependencies"])}
     assert markers["tomli"].evaluate({"python_version": "3.10"})
