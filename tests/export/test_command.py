@@ -377,6 +377,7 @@ def test_data_replaces_the_folder_of_the_capture(stranded, data, tmp_path):
         ({"title": "a"}, "--title is for --format html, not for ply"),
         ({"format": "html", "max_megabytes": -1.0}, "--max-megabytes must be positive"),
         ({"format": "html", "max_megabytes": 0.001}, r"the page would hold .* use about --max-gaussians \d+"),
+        ({"format": "html", "title": "a" * 201}, "--title must have at most 200 characters, got 201"),
     ],
 )
 def test_wrong_options_are_refused_and_nothing_is_written(run, tmp_path, options, message):

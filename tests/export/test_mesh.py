@@ -187,6 +187,8 @@ def test_one_branch_at_one_time_is_a_file_without_the_other(job, tmp_path, layer
         ({"frames": 3, "seconds": 2.0}, "--seconds is for a mesh that moves in one file: omit it, or --frames"),
         ({"voxel": -1.0}, "--voxel must be positive"),
         ({"voxel": 0.005}, "--voxel 0.005 needs .* more than the maximum of 100,000: use .* or larger"),
+        ({"voxel": 1e-9}, "--voxel 1e-09 is finer than the images"),
+        ({"voxel": 100.0}, "none is as large as the voxels of --voxel 100"),
         ({"precision": 2.0}, "--precision is for --format html, not for mesh"),
     ],
 )

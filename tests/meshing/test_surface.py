@@ -6,6 +6,7 @@ import torch
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
+from warpgs.meshing import tsdf
 from warpgs.meshing.depth_views import DepthView, depth_view
 from warpgs.meshing.surface import MIN_FACES, UNKNOWN, Surface, colors_of, mesh_of, surface_of, without_small_parts
 from warpgs.meshing.tsdf import SIDE, blocks_near, fitting_blocks, fuse
@@ -111,6 +112,12 @@ def test_a_voxel_that_is_too_small_is_refused_with_one_that_is_not():
         fitting_blocks(views, 100_000, 0.01)
     allowed = float(str(error.value).split("use ")[1].split()[0])
     assert fitting_blocks(views, 100_000, allowed)[0] == allowed
+
+
+def test_a_voxel_that_is_far_smaller_than_a_pixel_is_refused_before_voxels_are_counted(monkeypatch):
+    monkeypatch.setattr(tsdf, "blocks_near", lambda views, size: pytest.fail("counted"))
+    with pytest.raises(ValueError, match=r"--voxel 1e-09 is finer than the images: use 0\.00\d+ or larger"):
+        fitting_blocks([view_of_ball((1, 0, 0))], 10**9, 1e-9)
 
 
 @pytest.mark.parametrize("is_dynamic", [False, True])

@@ -55,7 +55,12 @@ def write_mesh(job: Job) -> str:
     frames = maker.dynamic(times) if times else []
     count = sum(len(mesh.faces) for mesh in frames)
     if not count and (static is None or not len(static.faces)):
-        raise ValueError(f"{options.run_folder}: no surface is opaque enough for a mesh in the training cameras")
+        raise ValueError(
+            f"{options.run_folder}: no surface is opaque enough for a mesh in the training cameras"
+            + (f", or none is as large as the voxels of --voxel {options.voxel:g}" if options.voxel else "")
+        )
+    if times and not count and options.voxel:
+        raise ValueError(f"--voxel {options.voxel:g} is larger than what moves: use a smaller one, or --layers static")
     summary = f"{0 if static is None else len(static.faces):,} static triangles"
     if times:
         summary += f" and {count:,} dynamic ones at {len(times)} {'time' if len(times) == 1 else 'times'}"

@@ -88,6 +88,10 @@ def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True, u
     return write_bytes(path, [_player(start.title, shared, "\n".join(blocks)).encode()])
 
 
+MAX_TITLE = 200
+"""Maximum number of characters of a title; services that show links cut longer ones."""
+
+
 def check_size(counts: Mapping[str, int], keys: int) -> None:
     """Refuses a scene that is too large for browsers.
 
@@ -181,6 +185,8 @@ def _check_memory(job: Job, keys: int) -> None:
 def _write(job: Job) -> str:
     options, path = job.options, job.file("scene.html")
     keys = options.keys or KEYS
+    if options.title is not None and len(options.title) > MAX_TITLE:
+        raise ValueError(f"--title must have at most {MAX_TITLE} characters, got {len(options.title):,}")
     _check_memory(job, keys)
     start = start_view(job.clouds, job.capture, keys, options.seconds or SECONDS)
     start = start if options.title is None else replace(start, title=options.title)

@@ -24,6 +24,9 @@ SIDE = 8
 TRUNCATION = 4.0
 """Distance from a surface at which values end [voxels]."""
 
+MAX_FINER = 8
+"""Maximum number of voxels along a pixel: depth images say nothing about finer ones, of which there are too many."""
+
 CHUNK = 128
 """Blocks that are computed at once: more do not fit in the caches of a processor."""
 
@@ -67,9 +70,12 @@ def fitting_blocks(
         voxel: The size; by default the smallest that needs no more voxels and is no smaller than a pixel.
 
     Raises:
-        ValueError: If ``voxel`` needs more voxels.
+        ValueError: If ``voxel`` needs more voxels, or is smaller than a pixel by far.
     """
-    size = voxel or finest(views)
+    pixel = finest(views)
+    if voxel is not None and voxel < pixel / MAX_FINER:
+        raise ValueError(f"--voxel {voxel:g} is finer than the images: use {1.05 * pixel / MAX_FINER:.2g} or larger")
+    size = voxel or pixel
     blocks = blocks_near(views, size)
     asked = len(blocks) * SIDE**3
     while (excess := len(blocks) * SIDE**3 / max_voxels) > 1.0:
