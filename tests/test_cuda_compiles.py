@@ -1,6 +1,7 @@
 """Every kernel compiles for CUDA, even on a machine without a GPU."""
 
 import importlib
+from pathlib import Path
 
 import pytest
 import warp as wp
@@ -18,9 +19,12 @@ from warpgs.ops.compositing import CUDA_PIXELS, SMALL_IMAGE_CUDA_PIXELS
 ARCHS = [75, 90]
 """Compute capabilities, times ten: the oldest that Warp supports, and one with all instructions that kernels use."""
 
+CARDS = {"RTX 20": 75, "RTX 30": 86, "RTX 40": 89, "RTX 50": 120}
+"""Compute capabilities, times ten, of series of cards; docs/start.md has the same."""
 
-def assert_compiles(module, folder):
-    for arch in ARCHS:
+
+def assert_compiles(module, folder, archs=ARCHS):
+    for arch in archs:
         wp.compile_aot_module(module, arch=arch, module_dir=folder / str(arch), use_ptx=True)
         (ptx,) = (folder / str(arch)).glob("*.ptx")
         assert f".target sm_{arch}" in ptx.read_text()
@@ -79,3 +83,17 @@ def test_compositing_compiles_for_other_channels(make, channels, tmp_path):
 @pytest.mark.parametrize("pixels", [CUDA_PIXELS, SMALL_IMAGE_CUDA_PIXELS])
 def test_median_depth_compiles(pixels, tmp_path):
     assert_compiles(make_composite_fwd(3, True, 1, pixels, False, True).module, tmp_path)
+
+
+@pytest.mark.parametrize("card", CARDS)
+def test_compositing_and_products_in_half_precision_compile_for_cards(card, tmp_path):
+    modules = make_composite_bwd(3, True, 3, CUDA_PIXELS, True).module, make_layer_bwd(True).module
+    for k, module in enumerate(modules):
+        assert_compiles(module, tmp_path / str(k), [CARDS[card]])
+
+
+@pytest.mark.parametrize("card", CARDS)
+def test_the_documentation_has_the_capabilities_of_cards(card):
+    page = (Path(__file__).parents[1] / "docs/start.md").read_text()
+    assert f"| {card}" in page
+    assert f"| {CARDS[card] / 10} |" in page
