@@ -37,7 +37,7 @@ def test_text_takes_an_eighth_more_than_the_bytes():
 
 @pytest.mark.skipif(node.NODE is None, reason="the test needs node")
 def test_the_player_decodes_the_same_bytes(tmp_path):
-    player = page._player("", "")
+    player = page._player("", "", "")
     program = re.search(r"const REPLACED = .*?\n}\n", player, re.DOTALL)[0]
     texts = json.dumps([to_text(data) for data in SAMPLES])
     printed = node.run(tmp_path, f"{program}console.log(JSON.stringify({texts}.map((text) => [...bytesOf(text)])))")

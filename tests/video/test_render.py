@@ -307,7 +307,7 @@ def test_bullet_time_follows_the_training_camera_unless_a_view_is_given(run, cap
     [
         ({"path": "fixed", "frames": 0}, "--frames must be between 1 and"),
         ({"frames": 3}, "--frames is for .* not for views"),
-        ({"view": "a"}, "--view is for fixed, spiral, bullet, not for views"),
+        ({"view": "a"}, "--view is for fixed, spiral, bullet, cameras, not for views"),
         ({"path": "frozen", "view": "a"}, "--view is for .* not for frozen"),
         ({"path": "fixed", "time": 0.0}, "--time is for frozen, spiral, bullet, not for fixed"),
         ({"path": "moving", "time": 0.5}, "--time is for .* not for moving"),

@@ -321,7 +321,7 @@ def _is_open_switch(hint: Any) -> bool:
 
 def _is_hidden(hint: Any) -> bool:
     """Whether a field is not an option, although its dataclass is of options."""
-    return tyro.conf.Suppress in getattr(hint, "__metadata__", ())
+    return tyro.conf.Fixed in getattr(hint, "__metadata__", ())
 
 
 def _plain(hint: Any) -> Any:
