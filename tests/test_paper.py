@@ -105,7 +105,7 @@ PAPER = {
 
 RUN = {"data", "dataset", "factor", "out", "resume", "preset", "iterations", "device", "seed", "graph", "lpips"}
 RUN |= {"lpips_net"}
-RUN |= {"readout", "damage_masks", "checkpoint_every", "resident_bytes"}
+RUN |= {"readout", "readout_from", "damage_masks", "checkpoint_every", "resident_bytes"}
 """Options of a run that do not belong to the method."""
 
 METHOD = Path(__file__).parents[1] / "docs" / "method.md"
