@@ -13,7 +13,7 @@ from warpgs.model.poses import PoseCorrections
 from warpgs.model.scene import SplitScene
 from warpgs.ops.dropout import MAX_SEED
 from warpgs.training import acceleration as module
-from warpgs.training.acceleration import acceleration, sample_paths
+from warpgs.training.acceleration import MAX_SAMPLES, acceleration, paths_of, sampled_points
 from warpgs.training.losses import LossInputs
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -21,9 +21,17 @@ pytestmark = pytest.mark.usefixtures("quickly")
 CAMERA = along_z(400.0, (480, 270))
 
 
+def sample_paths(scene, time, interval, seed):
+    """The [3, K, 3] paths of a step."""
+    points = sampled_points(scene, time, interval, seed)
+    return paths_of(points, scene.splats_and_offsets(points, time)[1])
+
+
 def measured(paths, camera=CAMERA, num_static=0):
     """The term for [3, K, 3] paths in a view of 100 pixels."""
-    view = SimpleNamespace(camera=camera, static_mask=torch.arange(100).view(10, 10) < num_static)
+    view = SimpleNamespace(
+        camera=camera, image=torch.zeros(10, 10, 3), static_mask=torch.arange(100).view(10, 10) < num_static
+    )
     return acceleration(LossInputs(plain.loss(), view, None, None, None, None, None, paths))
 
 
@@ -97,9 +105,11 @@ def test_cameras_get_no_gradient_by_moving_away():
 
 def test_without_dynamic_gaussians_the_term_is_0():
     scene = scene_of(0)
-    paths = sample_paths(scene, torch.tensor([0.5]), 0.1, torch.tensor([7.0]))
-    assert paths.shape == (3, 0, 3)
-    assert measured(paths, make_camera()).item() == 0.0
+    time = torch.tensor([0.5])
+    points = sampled_points(scene, time, 0.1, torch.tensor([7.0]))
+    assert len(points.means) == 0
+    assert scene.splats_and_offsets(points, time)[1] is None
+    assert measured(None, make_camera()).item() == 0.0
 
 
 def test_without_dynamic_gaussians_the_deformation_is_not_trained(data, tmp_path):
@@ -114,14 +124,14 @@ def test_paths_are_one_frame_apart_and_at_most_half_a_frame_from_the_time(monkey
     scene, times = scene_of(5), []
 
     def deformed(means, time):
-        times.append(time)
+        times.append(time[5:])  # those after the five Gaussians' own
         return torch.zeros(len(means), 10)
 
     monkeypatch.setattr(scene, "deformation", torch.nn.Identity())
     monkeypatch.setattr(scene.deformation, "forward", deformed)
     for seed in (0, MAX_SEED // 3, MAX_SEED - 1):
         sample_paths(scene, torch.tensor([0.4]), 0.1, torch.tensor([float(seed)]))
-    before, moment, after = torch.stack(times).view(3, 3, 5).unbind(1)  # of five Gaussians
+    before, moment, after = torch.stack(times).view(3, 3, 5).unbind(1)
     assert all(torch.equal(time, time[:, :1].expand(3, 5)) for time in (before, moment, after))
     before, moment, after = before[:, 0], moment[:, 0], after[:, 0]
     torch.testing.assert_close(moment - before, torch.full((3,), 0.1))
@@ -199,3 +209,15 @@ def test_a_weight_of_0_skips_the_term(data, tmp_path):
     plan = trainer.protocol.at(trainer.protocol.stage2.start)
     trainer.step(plan, trainer._sample(plan))
     assert "acceleration" not in trainer.step.take_means().terms
+
+
+def test_a_step_evaluates_the_deformation_once(data, tmp_path, monkeypatch):
+    trainer = tiny.trainer(data, tmp_path)
+    trainer._add_dynamic_gaussians()
+    deformation, calls = trainer.scene.deformation, []
+    forward = deformation.forward
+    monkeypatch.setattr(deformation, "forward", lambda *args: (calls.append(len(args[0])), forward(*args))[1])
+    plan, number = trainer.protocol.at(trainer.protocol.stage2.start), len(trainer.scene.dynamic)
+    trainer.step(plan, trainer._sample(plan))
+    assert 0 < number < MAX_SAMPLES
+    assert calls == [4 * number]  # at the time of the view, and at the three of the sample, which has them all

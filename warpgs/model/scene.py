@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -44,6 +45,18 @@ class AppearanceField(nn.Module):
         if is_fixed is not None:
             residuals, *logits = (torch.where(is_fixed[:, None], r.detach(), r) for r in (residuals, *logits))
         return residuals.unflatten(1, (self.bases, 3)), logits[0][:, 0] if logits else None
+
+
+class PointsInTime(NamedTuple):
+    """Arguments of a deformation model.
+
+    Attributes:
+        means: [N, 3] canonical positions [scene units].
+        times: [N] times in [0, 1], or [1] of all.
+    """
+
+    means: Float[Tensor, "N 3"]
+    times: Float[Tensor, " T"]
 
 
 class SplitScene(nn.Module):
@@ -124,25 +137,63 @@ class SplitScene(nn.Module):
                 (annealed smoothing of Deformable-3DGS, ``with_delays``).
             is_hidden: Static Gaussians from which the appearance network gets no gradient; none if None.
         """
+        return self.splats_and_offsets(None, time, use_deformation, use_appearance, sh_degree, time_noise, is_hidden)[0]
+
+    def splats_and_offsets(
+        self,
+        points: PointsInTime | None,
+        time: Float[Tensor, "1"],
+        use_deformation: bool = True,
+        use_appearance: bool = True,
+        sh_degree: int | None = None,
+        time_noise: Float[Tensor, " T"] | None = None,
+        is_hidden: Bool[Tensor, " num_static"] | None = None,
+    ) -> tuple[Splats, Float[Tensor, "M 10"] | None]:
+        """``splats``, and what the deformation returns for M other points, in one evaluation of it.
+
+        Its kernels are so many and so small that a second evaluation takes longer than more rows in the first one.
+
+        Args:
+            points: The other points; None without.
+            time, use_deformation, use_appearance, sh_degree, time_noise, is_hidden: As of ``splats``.
+
+        Returns:
+            The Gaussians, and [M, 10] offsets of the points; None without points, dynamic Gaussians or deformation.
+        """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
         residuals = logit_residuals = None
-        offsets = None
+        offsets = other_offsets = None
         with concurrently(device) as beside:
             with beside:
                 if use_appearance and len(static):
                     residuals, logit_residuals = self.appearance(static.means, time, is_hidden)
                 sh = join_sh(static.raw(), dynamic.raw(), residuals)
             if use_deformation and len(dynamic):
-                offsets = self.deformation(dynamic.means, time if time_noise is None else time + time_noise)
+                own = PointsInTime(dynamic.means, time if time_noise is None else time + time_noise)
+                offsets, other_offsets = self._offsets(own, points)
         static_changes, dynamic_changes = Changes(logit_residuals=logit_residuals), Changes(offsets)
         geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
         splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree)
+        return self._reflecting(splats), other_offsets
+
+    def _reflecting(self, splats: Splats) -> Splats:
+        """The splats with what the dynamic ones reflect, once all degrees of spherical harmonics are in use."""
+        dynamic, sh_degree = self.dynamic, splats.sh_degree
         if self.light is None or dynamic.reflectances is None or sh_degree not in (None, self.sh_degree):
             return splats
-        quats = splats.quats[len(static) :]
+        quats = splats.quats[len(self.static) :]
         reflected = reflections(self.light, dynamic.log_scales, quats, dynamic.reflectances)
         return dataclasses.replace(splats, reflections=reflected)
+
+    def _offsets(self, own: PointsInTime, others: PointsInTime | None) -> tuple[Tensor, Tensor | None]:
+        """Offsets of the deformation at the first points, and at the others if there are any."""
+        if others is None:
+            return self.deformation(*own), None
+        sizes = [len(own.means), len(others.means)]
+        times = torch.cat([own.times.expand(sizes[0]), others.times])
+        offsets, other_offsets = self.deformation(torch.cat([own.means, others.means]), times).split(sizes)
+        return offsets, other_offsets
 
     @torch.no_grad()
     def with_delays(

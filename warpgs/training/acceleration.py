@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from warpgs.model.scene import SplitScene
+from warpgs.model.scene import PointsInTime, SplitScene
 from warpgs.ops.dropout import MAX_SEED
 
 from .losses import LossInputs
@@ -21,12 +21,12 @@ MIN_DEPTH = 1e-3
 """Minimum depth of a Gaussian in front of the camera, relative to the farthest, so that its pixels have some size."""
 
 
-def sample_paths(
+def sampled_points(
     scene: SplitScene, time: Float[Tensor, "1"], interval: float, seed: Float[Tensor, "1"]
-) -> Float[Tensor, "3 K 3"]:
-    """Positions of a sample of the dynamic Gaussians, one frame before a moment, then, and one frame after.
+) -> PointsInTime:
+    """A sample of the dynamic Gaussians one frame before a moment, then, and one frame after.
 
-    The moment is random, up to half a frame from ``time``. Only the deformation gets gradients.
+    The moment is random, up to half a frame from ``time``.
 
     Args:
         scene: The scene.
@@ -35,20 +35,24 @@ def sample_paths(
         seed: An integer below ``MAX_SEED``, which chooses the moment and the sample.
 
     Returns:
-        [3, K, 3] positions [scene units]; K is at most ``MAX_SAMPLES``, 0 without dynamic Gaussians.
+        K canonical positions, at most ``MAX_SAMPLES``, at each of the three times; none without dynamic Gaussians.
     """
     means = scene.dynamic.means.detach()
-    if not len(means):
-        return means.new_zeros(3, 0, 3)
     # Consecutive Gaussians, so that nothing is sorted or drawn: each belongs to as many samples as any other.
     count = min(len(means), MAX_SAMPLES)
     first = torch.arange(count, device=means.device)
-    means = means[(first + seed.long()) % len(means)]
+    means = means[(first + seed.long()) % max(len(means), 1)]
     moment = time + (seed / MAX_SEED - 0.5) * interval
-    # In one evaluation: the kernels of three small ones take longer.
     shifts = (moment - interval, moment, moment + interval)
-    times = torch.cat([shift.expand(count) for shift in shifts])
-    return means + scene.deformation(means.repeat(3, 1), times)[:, :3].view(3, count, 3)
+    return PointsInTime(means.repeat(3, 1), torch.cat([shift.expand(count) for shift in shifts]))
+
+
+def paths_of(points: PointsInTime, offsets: Float[Tensor, "M 10"]) -> Float[Tensor, "3 K 3"]:
+    """[3, K, 3] positions of ``sampled_points`` at their three times [scene units], from what the deformation returns.
+
+    Only the deformation gets gradients.
+    """
+    return (points.means + offsets[:, :3]).view(3, -1, 3)
 
 
 def acceleration(inputs: LossInputs) -> Float[Tensor, ""]:
@@ -58,11 +62,9 @@ def acceleration(inputs: LossInputs) -> Float[Tensor, ""]:
     pixel has no size, count as 0. The mean is multiplied by the fraction of the pixels that are dynamic, because the
     image terms pull at small objects as much less. Neither depth nor camera gets a gradient for making pixels larger.
     """
-    paths, camera = inputs.paths, inputs.view.camera
-    assert paths is not None
-    before, now, after = paths
-    if not len(now):
-        return paths.sum()
+    if inputs.paths is None:
+        return inputs.view.image.new_zeros(())
+    (before, now, after), camera = inputs.paths, inputs.view.camera
     with torch.no_grad():
         depth = camera.depths(now)
         pixels = torch.where(depth > 0.0, camera.focal / depth.clamp_min(MIN_DEPTH * depth.abs().max()), 0.0)

@@ -29,7 +29,7 @@ class LossInputs(NamedTuple):
         alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.
         depth_trust: How much the view's depth is trusted. None like ``alignment``.
         paths: [3, K, 3] positions of some dynamic Gaussians one frame before a moment near that of the view, then, and
-            one frame after; None unless ``LossConfig.acceleration`` and the deformation are in use.
+            one frame after; None unless ``LossConfig.acceleration``, the deformation and dynamic Gaussians are in use.
         unit: Length that counts as 1 (``TrainConfig.length_unit``) [scene units].
     """
 

@@ -14,7 +14,7 @@ from warpgs.config import RenderSettings, TrainConfig
 from warpgs.data.capture import background_color
 from warpgs.evaluation.image_quality import MIN_SQUARED_ERROR
 from warpgs.initialization.alignment import DepthTrust
-from warpgs.model.scene import SplitScene
+from warpgs.model.scene import PointsInTime, SplitScene
 from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
 from warpgs.runtime import ranks
@@ -22,7 +22,7 @@ from warpgs.runtime.graphs import GraphCache
 from warpgs.views.views import View, Views
 
 from . import optimizer as optim
-from .acceleration import sample_paths
+from .acceleration import paths_of, sampled_points
 from .density import make_strategy
 from .loss_terms import TERMS
 from .losses import LossInputs, only_shown
@@ -167,17 +167,19 @@ class Step:
         noise = self._inputs.time_noise
         if phase.use_deformation:
             noise = self.scene.with_delays(view.camera, view.time, noise)
-        splats = self.scene.splats(view.time, *flags, phase.sh_degree, noise, is_hidden)
+        points = self._points(view) if phase.use_deformation and self.config.loss.acceleration > 0 else None
+        splats, offsets = self.scene.splats_and_offsets(points, view.time, *flags, phase.sh_degree, noise, is_hidden)
+        paths = None if points is None or offsets is None else paths_of(points, offsets)
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
-        backgrounds, offsets = self._backgrounds(), self.density.screen_offsets if phase.densifies else None
+        backgrounds = self._backgrounds()
+        screen_offsets = self.density.screen_offsets if phase.densifies else None
         behind = backgrounds if phase.with_branches else backgrounds[0]
-        rendering = render(splats, view.camera, behind, self._settings(phase), offsets)
+        rendering = render(splats, view.camera, behind, self._settings(phase), screen_offsets)
         rendering = only_shown(rendering, view, backgrounds[2])
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
-        paths = self._paths(view) if phase.use_deformation and config.acceleration > 0 else None
         length = self.config.length_unit(self.unit)
         inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust, paths, length)
         terms = {name: TERMS[name].compute(inputs) for name in self._active(phase)}
@@ -210,8 +212,8 @@ class Step:
         row, column, _, is_inside = view.camera.project(self.scene.static.means)
         return is_inside & ~view.static_mask[row, column]
 
-    def _paths(self, view: View) -> Float[Tensor, "3 K 3"]:
-        return sample_paths(self.scene, view.time, self.views.interval, self._inputs.dropout_seed)
+    def _points(self, view: View) -> PointsInTime:
+        return sampled_points(self.scene, view.time, self.views.interval, self._inputs.dropout_seed)
 
     def _depth_of_view(self) -> tuple[Tensor, DepthTrust]:
         """Alignment of the depth of the selected view, and how much it is trusted."""
