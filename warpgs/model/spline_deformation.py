@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from warpgs.config import ModelConfig
@@ -53,22 +53,19 @@ class SplineDeformation(nn.Module):
         nearest = torch.cdist(means.detach(), self.homes).argmin(1)
         # The backward pass of indexing by brackets is 20 times as slow where few rows are chosen often.
         homes = self.homes.index_select(0, nearest)
-        if len(time) == 1:
-            positions = self.positions(time).index_select(0, nearest)
-        else:
-            positions = self.positions(time, self.paths.index_select(0, nearest))
+        positions = self.positions(time).index_select(0, nearest) if len(time) == 1 else self.positions(time, nearest)
         return self.network(means, time) + nn.functional.pad(positions - homes, (0, 7))
 
-    def positions(self, time: Float[Tensor, " T"], paths: Float[Tensor, "M C 3"] | None = None) -> Float[Tensor, "M 3"]:
-        """Positions on paths, by default those of all objects, at one time or at M.
+    def positions(self, time: Float[Tensor, " T"], objects: Int64[Tensor, " M"] | None = None) -> Float[Tensor, "M 3"]:
+        """Positions of objects on their paths, by default of all of them, at one time or at M.
 
         Outside [0, 1], the first or last piece of the splines goes on.
         """
-        paths = self.paths if paths is None else paths
-        pieces = paths.shape[1] - 3
+        objects = torch.arange(len(self.paths), device=time.device) if objects is None else objects
+        pieces = self.paths.shape[1] - 3
         first = (time * pieces).floor().clamp(0, pieces - 1)
         f = time * pieces - first
         weights = torch.stack([(1 - f) ** 3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3], 1) / 6
-        chosen = first.long()[:, None] + torch.arange(4, device=time.device)
-        points = paths.gather(1, chosen[:, :, None].expand(len(paths), 4, 3))
+        chosen = (objects * self.paths.shape[1] + first.long())[:, None] + torch.arange(4, device=time.device)
+        points = self.paths.flatten(0, 1).index_select(0, chosen.flatten()).view(-1, 4, 3)
         return (points * weights[:, :, None]).sum(1) * self.network.units[:3]
