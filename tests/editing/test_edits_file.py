@@ -133,6 +133,7 @@ def test_a_file_that_is_named_must_exist(tmp_path, scene):
         ({"erased": {"count": True, "bits": ""}}, "count of erased must be in"),
         ({"erased": {"count": 9, "bits": "?"}}, "bits of erased are damaged"),
         ({"erased": {"count": 9, "bits": "AAAA"}}, "bits of erased are damaged"),
+        ({"erased": {"count": 9, "bits": "é"}}, "bits of erased are damaged"),
         ({"erased": {"count": 9, "bits": BOMB}}, "bits of erased are not those of 9 Gaussians"),
         ({"erased": {"count": 9, "bits": BOMB[:8]}}, "bits of erased are not those of 9 Gaussians"),
         ({"erased": {"count": 7, "bits": Marked.of(np.ones(8, bool)).for_json()["bits"]}}, "are not those of 7"),

@@ -300,6 +300,14 @@ def test_a_still_camera_films_the_whole_scene(tmp_path, pxr):
     assert torch.equal(read[0].viewmat, read[-1].viewmat)
 
 
+def test_a_still_camera_that_another_program_added_films_at_each_time_code(tmp_path, pxr):
+    made, path = written(tmp_path, "usd"), tmp_path / "more.usda"
+    stage = importlib.import_module("pxr.Usd").Stage.Open(str(tmp_path / "cameras.usdc"))
+    importlib.import_module("pxr.UsdGeom").Camera.Define(stage, "/Cameras/extra")
+    stage.Export(str(path))
+    assert [camera.time for camera in read_cameras(path, made, "extra")] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+
+
 def test_one_of_several_cameras_is_chosen_by_its_name(tmp_path, pxr):
     stage, path = animated(tmp_path / "shot.usda"), tmp_path / "shot.usda"
     importlib.import_module("pxr.UsdGeom").Camera.Define(stage, "/rig/side").AddTranslateOp().Set((5.0, 0.0, 0.0))
@@ -308,7 +316,7 @@ def test_one_of_several_cameras_is_chosen_by_its_name(tmp_path, pxr):
         read_cameras(path, capture())
     for name in ("side", "/rig/side"):
         assert len(read_cameras(path, capture(), name)) == 5
-    with pytest.raises(ValueError, match="has no camera top; its cameras are: /rig/main, /rig/side"):
+    with pytest.raises(ValueError, match="has no camera top: give --view one of its cameras, /rig/main, /rig/side"):
         read_cameras(path, capture(), "top")
 
 
@@ -322,6 +330,8 @@ def test_one_of_several_cameras_is_chosen_by_its_name(tmp_path, pxr):
             "float horizontalAperture = 1e6",
             "would have an image of 7,864,320 × 480 pixels",
         ),
+        ("float focalLength = 50", 'string focalLength = "x"', "/rig/main.focalLength must be a number at 11, got 'x'"),
+        ("float focalLength = 50", "float focalLength.timeSamples = {11: None}", "must be a number at 11, got None"),
         ("float focalLength = 50", 'token projection = "orthographic"', "projection perspective"),
         ("float focalLength = 50", "float horizontalApertureOffset = 99", "outside of the image"),
         ("(2, 2, 2)", "(2, 2, -2)", "is more than turned, scaled and moved"),
@@ -333,7 +343,7 @@ def test_one_of_several_cameras_is_chosen_by_its_name(tmp_path, pxr):
         ("metersPerUnit = 1", "subLayers = [@./other.usda@]", "refers to other files"),
         ('def Xform "rig"', 'def Xform "rig" (references = @./other.usda@)', "refers to other files"),
         ('def Xform "rig"', 'def Xform "rig" (payload = @./other.usda@)', "refers to other files"),
-        ('def Camera "main"', 'def Xform "main"', "has no camera; its cameras are: none"),
+        ('def Camera "main"', 'def Xform "main"', "has no cameras: export the camera of the other program, too"),
         ("metersPerUnit = 1", "customLayerData = {double warpgsRotation = 2}", "must be a rotation"),
         ('def Camera "main"', 'def Camera "main" (customData = {string warpgsSize = "big"})', "must be two integers"),
         ("#usda", "#other", "is not a file of OpenUSD"),

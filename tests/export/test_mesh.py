@@ -1,5 +1,6 @@
 """Meshes: what is written, and when each frame is shown."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -146,7 +147,7 @@ def job(scene, capture, finished_run, tmp_path):
 def test_a_mesh_has_the_static_part_once_and_what_moves_at_each_time(job, tmp_path):
     summary = write_mesh(job(keys=3, seconds=2.0, up="-y", voxel=0.03))
     assert "dynamic ones at 3 times" in summary
-    assert "0.03 scene units (static) 0.03 scene units (dynamic)" in summary
+    assert "voxels have 0.03 scene units (static) and 0.03 scene units (dynamic)" in summary
     document = document_of(tmp_path / "mesh.glb")
     assert [node["name"] for node in document["nodes"]] == [
         "static",
@@ -160,14 +161,45 @@ def test_a_mesh_has_the_static_part_once_and_what_moves_at_each_time(job, tmp_pa
         assert high - low == pytest.approx([0.65] * 3, abs=0.12)
 
 
-def test_frames_are_ply_files_and_a_shorter_sequence_replaces_a_longer_one(job, tmp_path):
+def test_frames_are_ply_files_and_replace_what_was_exported_before(job, tmp_path):
     write_mesh(job(frames=3, voxel=0.05))
-    write_mesh(job(frames=2, voxel=0.05))
+    write_mesh(job(keys=2, voxel=0.05))
+    assert [path.name for path in tmp_path.iterdir()] == ["mesh.glb"]
+    summary = write_mesh(job(frames=2, voxel=0.05))
+    assert summary.startswith(f"static_mesh.ply and dynamic_mesh_00000.ply to dynamic_mesh_00001.ply in {tmp_path}: ")
     names = ["dynamic_mesh_00000.ply", "dynamic_mesh_00001.ply", "static_mesh.ply"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     vertices = [read_ply(tmp_path / name, first_only=True)["vertex"] for name in names[1:]]
     assert [float(np.sign(v["x"].mean())) for v in vertices] == [1.0, -1.0]
     assert [int(v["blue"].mean() > v["red"].mean()) for v in vertices] == [1, 0]
+
+
+def test_a_file_leaves_what_is_next_to_it(job, tmp_path):
+    write_mesh(job(frames=1, layers="static", voxel=0.05))
+    made = job(layers="static", voxel=0.05)
+    made.options = dataclasses.replace(made.options, out=tmp_path / "other.glb")
+    assert write_mesh(made).startswith(f"{tmp_path / 'other.glb'}: ")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other.glb", "static_mesh.ply"]
+
+
+def test_times_at_which_nothing_is_seen_do_not_decide_about_voxels(job, monkeypatch):
+    """Voxels of a scene in small units, at whose first time nothing moves."""
+    seen = depth_views.depth_view
+
+    def small(splats, is_dynamic, camera, settings):
+        view = seen(splats, is_dynamic, camera, settings)
+        viewmat = camera.viewmat.clone()
+        viewmat[:3, 3] *= 0.1
+        scale = 0.0 if camera.time == 0 else 0.1
+        return view._replace(depth=scale * view.depth, camera=dataclasses.replace(camera, viewmat=viewmat))
+
+    monkeypatch.setattr(mesh, "depth_view", small)
+    monkeypatch.setattr(mesh, "NUM_NEAR", 1)
+    monkeypatch.setattr(mesh, "NUM_OTHER", 0)
+    maker = mesh._Maker(job())
+    meshes = maker.dynamic([0.0, 3 / 7, 1.0])
+    assert [len(made.faces) > 0 for made in meshes] == [False, True, True]
+    assert maker.note.endswith("voxels have 0.0033 scene units (dynamic)")
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,12 @@ def test_a_voxel_that_is_far_smaller_than_a_pixel_is_refused_before_voxels_are_c
         fitting_blocks([view_of_ball((1, 0, 0))], 10**9, 1e-9)
 
 
+def test_a_voxel_is_not_compared_with_the_pixels_of_images_in_which_nothing_is_seen():
+    view = view_of_ball((1, 0, 0))
+    voxel, blocks = fitting_blocks([view._replace(depth=torch.zeros_like(view.depth))], 10**9, 1e-9)
+    assert (voxel, len(blocks)) == (1e-9, 0)
+
+
 @pytest.mark.parametrize("is_dynamic", [False, True])
 def test_depth_is_the_median_of_one_branch(is_dynamic):
     """A wall at 3 and a faint one before it at 2, of the branch; the other branch has a wall at 1."""

@@ -1,7 +1,6 @@
 """Which Gaussians of a scene are marked, one bit each: hashable, comparable and small in files."""
 
 import base64
-import binascii
 import reprlib
 import zlib
 from pathlib import Path
@@ -63,7 +62,7 @@ def parse_marked(path: Path, name: str, values: Any) -> Marked:
     try:
         stream = zlib.decompressobj()
         bits = stream.decompress(base64.b64decode(values["bits"], validate=True), size + 1)
-    except (binascii.Error, zlib.error) as error:
+    except (ValueError, zlib.error) as error:  # not of Base64, some of it not even ASCII
         raise ValueError(f"{path}: bits of {name} are damaged: {error}") from None
     if len(bits) != size or not stream.eof or bits[-1] & (0xFF >> (count - 1) % 8 + 1):
         raise ValueError(f"{path}: bits of {name} are not those of {count:,} Gaussians")

@@ -17,12 +17,16 @@ from warpgs.formats.mesh import Mesh, write_mesh_ply
 from warpgs.formats.mesh_gltf import write_mesh_glb
 from warpgs.meshing.depth_views import DepthView, depth_view
 from warpgs.meshing.surface import mesh_of
-from warpgs.meshing.tsdf import fitting_blocks, fuse
+from warpgs.meshing.tsdf import coarsened_blocks, finest, fitting_blocks, fuse
+from warpgs.model.splats import Splats
 from warpgs.video.camera_paths import evenly_spaced as evenly_spaced_times
 
 from .job import Job, Writer
 from .moving import KEYS, SECONDS
 from .options import Export
+
+NAME, STATIC = "mesh.glb", "static_mesh.ply"
+"""Files: of all, and with ``--frames`` of what is static."""
 
 NUM_STATIC, NUM_NEAR, NUM_OTHER = 48, 4, 8
 """Numbers of training cameras: that see what is static, and, of each time, nearest in time and of all times.
@@ -64,12 +68,13 @@ def write_mesh(job: Job) -> str:
     summary = f"{0 if static is None else len(static.faces):,} static triangles"
     if times:
         summary += f" and {count:,} dynamic ones at {len(times)} {'time' if len(times) == 1 else 'times'}"
+    _remove_former(job)
     if options.frames is None:
-        path = job.file("mesh.glb")
-        size = write_mesh_glb(path, static, frames, options.seconds or SECONDS)
-        return f"{path}: {summary}, {size / 1e6:.1f} MB\n{maker.note}\n{job.up_note}"
-    size = _write_sequence(job.folder, static, frames)
-    return f"{job.folder}: {summary}, {size / 1e6:.1f} MB\n{maker.note}\n{job.up_note}"
+        path = str(job.file(NAME))
+        size = write_mesh_glb(job.file(NAME), static, frames, options.seconds or SECONDS)
+    else:
+        path, size = _write_sequence(job.folder, static, frames)
+    return f"{path}: {summary}, {size / 1e6:.1f} MB\n{maker.note}\n{job.up_note}"
 
 
 def _check(options: Export) -> None:
@@ -82,11 +87,23 @@ def _check(options: Export) -> None:
             raise ValueError(f"--{name} is for a mesh that moves in one file: omit it, or {single}")
 
 
-def _write_sequence(folder: Path, static: Mesh | None, frames: Sequence[Mesh]) -> int:
-    """Writes a PLY file of what is static and one of each frame; returns their size [bytes]."""
-    remove_numbered(folder, _numbered)  # an earlier sequence may have been longer
-    size = write_mesh_ply(folder / "static_mesh.ply", static) if static is not None else 0
-    return size + sum(write_mesh_ply(folder / _numbered(k), mesh) for k, mesh in enumerate(frames))
+def _remove_former(job: Job) -> None:
+    """Removes the meshes of an earlier export to the folder: they are of another scene, or its sequence was longer."""
+    if job.file(NAME) != job.folder:
+        remove_numbered(job.folder, _numbered)
+        for name in (NAME, STATIC):
+            (job.folder / name).unlink(missing_ok=True)
+
+
+def _write_sequence(folder: Path, static: Mesh | None, frames: Sequence[Mesh]) -> tuple[str, int]:
+    """Writes a PLY file of what is static and one of each frame; returns their names and their size [bytes]."""
+    names, size = [] if static is None else [STATIC], 0
+    if static is not None:
+        size += write_mesh_ply(folder / STATIC, static)
+    size += sum(write_mesh_ply(folder / _numbered(k), mesh) for k, mesh in enumerate(frames))
+    if frames:
+        names.append(_numbered(0) + (f" to {_numbered(len(frames) - 1)}" if len(frames) > 1 else ""))
+    return f"{' and '.join(names)} in {folder}", size
 
 
 def _numbered(number: int) -> str:
@@ -98,53 +115,68 @@ class _Maker:
 
     Attributes:
         moves: Whether there are dynamic Gaussians.
-        note: A line about the voxels and the cameras.
     """
 
     def __init__(self, job: Job) -> None:
+        self._capture_note = job.capture_note
         self._scene, self._voxel, self._quiet = job.clouds.scene, job.options.voxel, job.options.quiet
         self._rotation, self._settings = job.rotation(y_up=True), self._scene.config.render_settings
         capture = job.capture
-        self._cameras = sample_cameras(self._scene, None)
-        if capture is not None:
+        if capture is None:
+            self._cameras = sample_cameras(self._scene, None)
+        else:
             self._cameras = [capture.cameras[name] for name in capture.in_time(capture.train)]
         self.moves = len(self._scene.scene.dynamic) > 0
-        self.note = f"by {job.capture_note}; voxels have"
+        self._voxels: list[str] = []
+
+    @property
+    def note(self) -> str:
+        """A line about the cameras and the voxels."""
+        return f"by {self._capture_note}; voxels have {' and '.join(self._voxels)}"
 
     def static(self) -> Mesh | None:
         """The mesh of the static Gaussians; None without any."""
         if not len(self._scene.scene.static):
             return None
         cameras = evenly_spaced(self._cameras, NUM_STATIC)
-        views = [self._view(False, camera, camera.time) for camera in progress(cameras, "static mesh", self._quiet)]
+        views = [
+            self._view(self._scene.splats(camera.time), False, camera)
+            for camera in progress(cameras, "static mesh", self._quiet)
+        ]
         voxel = self._fitting([views], MAX_DEFAULT)
-        self.note += f" {voxel:.2g} scene units (static)"
+        self._voxels.append(f"{voxel:.2g} scene units (static)")
         return self._mesh(views, voxel)
 
     def dynamic(self, times: Sequence[float]) -> list[Mesh]:
         """The meshes of the dynamic Gaussians at times."""
         samples = [self._views_at(time) for time in evenly_spaced(times, 3)]
         voxel = self._fitting(samples, max(MIN_DEFAULT, MAX_DEFAULT // len(times)))
-        self.note += f" {voxel:.2g} scene units (dynamic)"
+        self._voxels.append(f"{voxel:.2g} scene units (dynamic)")
         return [self._mesh(self._views_at(time), voxel) for time in progress(times, "dynamic meshes", self._quiet)]
 
     def _views_at(self, time: float) -> list[DepthView]:
         """What cameras near in time, and some of all times, see of the dynamic Gaussians at a time."""
         by_distance = sorted(self._cameras, key=lambda camera: abs(camera.time - time))
         others = sorted(by_distance[NUM_NEAR:], key=lambda camera: camera.time)
-        chosen = (*by_distance[:NUM_NEAR], *evenly_spaced(others, NUM_OTHER))
-        return [self._view(True, camera, time) for camera in chosen]
+        chosen, splats = (*by_distance[:NUM_NEAR], *evenly_spaced(others, NUM_OTHER)), self._scene.splats(time)
+        return [self._view(splats, True, camera) for camera in chosen]
 
-    def _view(self, is_dynamic: bool, camera: Camera, time: float) -> DepthView:
-        return depth_view(self._scene.splats(time), is_dynamic, camera, self._settings)
+    def _view(self, splats: Splats, is_dynamic: bool, camera: Camera) -> DepthView:
+        return depth_view(splats, is_dynamic, camera, self._settings)
 
     def _fitting(self, samples: Sequence[Sequence[DepthView]], max_default: int) -> float:
-        """The size of voxels that is asked for, or at which all samples have few voxels [scene units]."""
+        """The size of voxels that is asked for, or at which all samples have few voxels [scene units].
+
+        Samples in which nothing is seen say nothing about it, unless all are so.
+        """
         limit = max_default if self._voxel is None else MAX_VOXELS
-        return max(fitting_blocks(views, limit, self._voxel)[0] for views in samples)
+        seen = [views for views in samples if finest(views) is not None]
+        return max(fitting_blocks(views, limit, self._voxel)[0] for views in seen or samples)
 
     def _mesh(self, views: Sequence[DepthView], voxel: float) -> Mesh:
-        voxel, blocks = fitting_blocks(views, MAX_VOXELS, voxel)
+        # Only a size that the user chose is refused, at times that are no samples, too.
+        fitting = coarsened_blocks if self._voxel is None else fitting_blocks
+        voxel, blocks = fitting(views, MAX_VOXELS, voxel)
         return mesh_of(fuse(views, voxel, blocks), views).rotated(self._rotation)
 
 

@@ -67,21 +67,18 @@ def fitting_blocks(
     Args:
         views: At least one.
         max_voxels: Maximum number of voxels.
-        voxel: The size; by default the smallest that needs no more voxels and is no smaller than a pixel.
+        voxel: The size; by default the smallest that needs no more voxels and is no smaller than a pixel (1 where
+            nothing is seen).
 
     Raises:
         ValueError: If ``voxel`` needs more voxels, or is smaller than a pixel by far.
     """
     pixel = finest(views)
-    if voxel is not None and voxel < pixel / MAX_FINER:
+    if voxel is not None and pixel is not None and voxel < pixel / MAX_FINER:
         raise ValueError(f"--voxel {voxel:g} is finer than the images: use {1.05 * pixel / MAX_FINER:.2g} or larger")
-    size = voxel or pixel
-    blocks = blocks_near(views, size)
-    asked = len(blocks) * SIDE**3
-    while (excess := len(blocks) * SIDE**3 / max_voxels) > 1.0:
-        size *= max(1.05, math.sqrt(excess))  # surfaces have a number of voxels that falls with the square
-        blocks = blocks_near(views, size)
+    size, blocks = coarsened_blocks(views, max_voxels, voxel or pixel or 1.0)
     if voxel is not None and size > voxel:
+        asked = len(blocks_near(views, voxel)) * SIDE**3
         raise ValueError(
             f"--voxel {voxel:g} needs {asked:,} voxels, more than the maximum of {max_voxels:,}: "
             f"use {1.05 * size:.2g} or larger"
@@ -89,10 +86,19 @@ def fitting_blocks(
     return size, blocks
 
 
-def finest(views: Sequence[DepthView]) -> float:
-    """Median size of what a pixel shows [scene units]; 0.01 where nothing is seen."""
+def coarsened_blocks(views: Iterable[DepthView], max_voxels: int, voxel: float) -> tuple[float, Int64[Tensor, "B 3"]]:
+    """As ``fitting_blocks``, of a size of voxels, or a larger one if that needs too many."""
+    blocks = blocks_near(views, voxel)
+    while (excess := len(blocks) * SIDE**3 / max_voxels) > 1.0:
+        voxel *= max(1.05, math.sqrt(excess))  # surfaces have a number of voxels that falls with the square
+        blocks = blocks_near(views, voxel)
+    return voxel, blocks
+
+
+def finest(views: Iterable[DepthView]) -> float | None:
+    """Median size of what a pixel shows [scene units]; None where nothing is seen."""
     sizes = torch.cat([view.depth[view.depth > 0][::16] / view.camera.focal for view in views])
-    return float(sizes.median()) if len(sizes) else 0.01
+    return float(sizes.median()) if len(sizes) else None
 
 
 def fuse(views: Iterable[DepthView], voxel: float, blocks: Int64[Tensor, "B 3"]) -> Field:

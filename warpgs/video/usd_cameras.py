@@ -6,6 +6,7 @@ are in the coordinates of files that ``warpgs export`` writes by default, uprigh
 """
 
 import math
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -111,11 +112,12 @@ def _cameras_of(path: Path, stage: Any, name: str | None, is_one: bool) -> list[
     paths = [str(camera.GetPath()) for camera in found]
     if name is not None:
         found = [camera for camera in found if name in (str(camera.GetPath()), camera.GetPrim().GetName())]
-    known = few_of(paths) if paths else "none"
+    if not paths:
+        raise ValueError(f"{path} has no cameras: export the camera of the other program, too")
     if not found:
-        raise ValueError(f"{path} has no camera{'' if name is None else f' {name}'}; its cameras are: {known}")
+        raise ValueError(f"{path} has no camera {name}: give --view one of its cameras, {few_of(paths)}")
     if len(found) > 1 and (is_one or name is not None):
-        raise ValueError(f"{path} has {len(found)} such cameras, choose one by --view: {known}")
+        raise ValueError(f"{path} has {len(found)} such cameras, choose one by --view: {few_of(paths)}")
     return found
 
 
@@ -144,7 +146,7 @@ def _codes(path: Path, stage: Any, camera: Any, at_samples: bool) -> list[tuple[
         raise ValueError(f"{path}: expected time codes of at most {MAX_FRAMES:,} frames, got {start:g} to {end:g}")
     if start == end:
         return [(start, time) for time in evenly_spaced(STILL_FRAMES)]
-    codes = samples if at_samples else [start + k for k in range(math.floor(end - start) + 1)]
+    codes = samples if at_samples and samples else [start + k for k in range(math.floor(end - start) + 1)]
     times = [(code, (code - start) / (end - start)) for code in codes]
     if not all(0 <= time <= 1 for _, time in times):
         raise ValueError(f"{path}: {camera.GetPath()} has time samples outside of the range {start:g} to {end:g}")
@@ -177,12 +179,11 @@ def _camera(path: Path, camera: Any, code: Any, pose: tuple[np.ndarray, np.ndarr
     """The camera of a prim at a time code, with an image of a height [px]."""
     if camera.GetProjectionAttr().Get(code) != "perspective":
         raise ValueError(f"{path}: {camera.GetPath()} must have the projection perspective")
-    focal, across, down = (
-        float(attribute.Get(code))
-        for attribute in (
-            camera.GetFocalLengthAttr(),
-            camera.GetHorizontalApertureAttr(),
-            camera.GetVerticalApertureAttr(),
+    focal, across, down, right, up = (
+        _number(path, getattr(camera, f"Get{name}Attr")(), code)
+        for name in (
+            *("FocalLength", "HorizontalAperture", "VerticalAperture"),
+            *("HorizontalApertureOffset", "VerticalApertureOffset"),
         )
     )
     if not all(0 < value <= MAX_NUMBER for value in (focal, across, down)):
@@ -193,13 +194,17 @@ def _camera(path: Path, camera: Any, code: Any, pose: tuple[np.ndarray, np.ndarr
     width, height = (round(height * min(across / down, MAX_SIDE)), height) if given is None else map(int, given)
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"{path}: {camera.GetPath()} would have an image of {width:,} × {height:,} pixels")
-    right, up = (
-        float(attribute.Get(code))
-        for attribute in (camera.GetHorizontalApertureOffsetAttr(), camera.GetVerticalApertureOffsetAttr())
-    )
     if not (abs(right) <= across and abs(up) <= down):
         raise ValueError(f"{path}: {camera.GetPath()} has its axis outside of the image at {code}")
     center = (0.5 - right / across) * width, (0.5 + up / down) * height
     K = intrinsic_matrix((focal / across * width, focal / down * height), center)
     rotation, position = pose
     return Camera.posed(rotation.T, position, K, (width, height), 0.0)
+
+
+def _number(path: Path, attribute: Any, code: Any) -> float:
+    """The value of an attribute at a time code."""
+    value = attribute.Get(code)
+    if type(value) is not float:
+        raise ValueError(f"{path}: {attribute.GetPath()} must be a number at {code}, got {reprlib.repr(value)}")
+    return value
