@@ -17,6 +17,7 @@ from warpgs.errors import (
     ADVICE,
     CLOSED,
     command,
+    counted,
     is_out_of_memory,
     missing,
     not_one_of,
@@ -218,3 +219,8 @@ def test_output_that_nobody_reads_is_no_error(arguments, unbuffered):
     ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, env=environment)
     os.close(writer)
     assert (ended.returncode, ended.stderr) == (CLOSED, b"")
+
+
+@pytest.mark.parametrize(("number", "text"), [(0, "0 images"), (1, "1 image"), (2, "2 images"), (1200, "1,200 images")])
+def test_one_thing_is_not_several(number, text):
+    assert counted(number, "image") == text

@@ -219,6 +219,11 @@ def suggestion(given: str, known: Iterable[str], shown: Callable[[str], object] 
     return f"; did you mean {shown(by_lower_case[first])}?"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number of things in words: 1 image, 1,200 images."""
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def not_one_of(name: str, given: object, known: Iterable[str]) -> str:
     """Message that the value of an option is not one of those that are known, and the similar one."""
     known = list(known)

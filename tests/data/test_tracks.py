@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from tests import tiny
 from tests.data import captures
 from warpgs.captures.import_capture import import_capture
 from warpgs.captures.opening import load_capture
 from warpgs.data.results.tracks import read_tracked_points
 from warpgs.data.tracks import read_tracks, write_tracks
+from warpgs.initialization.prepare_start import prepare_start
 
 SIZE = (40, 24)
 COUNT, FRAMES = 7, 5
@@ -155,6 +157,22 @@ def test_a_size_that_is_none_is_refused(tmp_path, seen, size):
     np.savez(tmp_path / "tracks.npz", tracks=positions, visibles=visible, size=size)
     with pytest.raises(ValueError, match="size must be the width and height"):
         read_tracks(tmp_path, NAMES)
+
+
+def test_tracks_are_read_once_and_only_if_they_are_needed(tmp_path, seen):
+    root = captures.write_capture(tmp_path / "capture")
+    film = load_capture(root).film
+    positions, visible = (np.resize(values, (COUNT, len(film), *values.shape[2:])) for values in seen)
+    write_tracks(root, positions, visible, captures.SIZE)
+    capture = load_capture(root)
+    assert capture.tracks is capture.tracks is capture.assuming("static").tracks
+    (root / "tracks.npz").write_bytes(b"damaged")
+    damaged = load_capture(root)
+    advice = r"\. Delete tracks\.npz to train without tracks, or add others with warpgs prepare CAPTURE --add tracks"
+    with pytest.raises(ValueError, match=rf"tracks\.npz .*{advice}"):
+        _ = damaged.tracks
+    with pytest.raises(ValueError, match=advice):  # before the first step
+        prepare_start(tiny.CONFIG, damaged)
 
 
 def test_an_import_keeps_tracks(tmp_path, seen):

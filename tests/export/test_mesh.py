@@ -91,7 +91,7 @@ def test_a_mesh_of_one_time_has_no_animation(path, frames):
 
 
 def test_no_triangles_are_refused(path):
-    with pytest.raises(ValueError, match="there are no triangles"):
+    with pytest.raises(ValueError, match="the meshes have no triangles: use a smaller --voxel"):
         write_mesh_glb(path, NOTHING, [NOTHING], 1.0)
     assert not path.exists()
 

@@ -66,7 +66,7 @@ def test_a_jump_of_exposure_is_divided_out_of_the_views_and_noted(capture, monke
     plain, evened = (prepare_start(dataclasses.replace(tiny.CONFIG, exposure=on), capture) for on in (False, True))
     assert torch.allclose(evened.views[1].image, plain.views[1].image / 2.0, atol=1 / 255)
     assert torch.equal(evened.views[0].image, plain.views[0].image)
-    sentence = "exposure jumps: 1 frames are divided by 1.00 to 2.00"
+    sentence = "exposure jumps: 1 frame divided by 1.00 to 2.00"
     assert (sentence in evened.notes, sentence in plain.notes) == (True, False)
 
 

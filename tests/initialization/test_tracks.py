@@ -177,7 +177,7 @@ def test_the_config_follows_tracks_from_the_start(capture, preset):
     assert (found.schedule.deform_from, found.schedule.noise_until) == (0, 0)
     assert found.optim.networks == MAX_RATE
     assert found.optim.networks_end == min(MAX_FINAL_RATE, PRESETS[preset].optim.networks_end)
-    assert "5 objects move far from frame to frame: dynamic Gaussians start on their tracks" in start.notes
+    assert "dynamic Gaussians start on the tracks of 5 objects, which move far from frame to frame" in start.notes
     assert isinstance(start.scene.deformation, SplineDeformation)
 
 

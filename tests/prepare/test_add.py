@@ -354,6 +354,28 @@ def test_masks_of_a_network_are_copied_and_count_as_estimates(root, tmp_path):
     assert (root / "masks.png").is_file()
 
 
+@pytest.mark.parametrize(("part", "plural"), [("mask", "masks"), ("depth", "depths")])
+def test_results_in_full_size_are_written_one_by_one_after_all_were_checked(root, tmp_path, monkeypatch, part, plural):
+    """So that those of a long video need no memory, and a damaged one leaves no capture with some."""
+    events, read, write = [], getattr(add, f"read_{plural}"), getattr(add.writer, f"write_{part}")
+    array = option = "masks" if part == "mask" else "depth"
+
+    def reading(path, names, sizes):
+        for name, result in zip(names, read(path, names, sizes), strict=True):
+            events.append(name)
+            yield result
+
+    def writing(root, name, *arguments):
+        events.append(f"write {name}")
+        write(root, name, *arguments)
+
+    monkeypatch.setattr(add, f"read_{plural}", reading)
+    monkeypatch.setattr(add.writer, f"write_{part}", writing)
+    np.savez(tmp_path / "results.npz", **{array: np.ones((COUNT, 96, 128), np.float32)})
+    add_parts(root, AddOptions([option], **{option: str(tmp_path / "results.npz")}))
+    assert events == [*NAMES, *(event for name in NAMES for event in (name, f"write {name}"))]
+
+
 def test_depth_of_a_network_is_copied_as_inverse_depth(root, tmp_path):
     depth = np.random.default_rng(0).uniform(1.0, 4.0, (COUNT, 96, 128))
     np.savez(tmp_path / "results.npz", depth=depth)

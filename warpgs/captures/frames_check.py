@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from warpgs.data.capture import MASKS_REMEDY, Capture
+from warpgs.errors import counted
 
 from .check_sample import Content
 from .findings import Finding, few_of
@@ -20,7 +21,9 @@ def check_counts(capture: Capture) -> Iterator[Finding]:
     yield from (Finding("note", "files", text) for text in capture.notes)
     sizes = sorted({camera.size for camera in capture.cameras.values()})
     shown = ", ".join(f"{w}×{h}" for w, h in sizes[:4])
-    yield Finding("note", "counts", f"{len(capture.train)} frames to train on, {len(capture.val)} to evaluate, {shown}")
+    yield Finding(
+        "note", "counts", f"{counted(len(capture.train), 'frame')} to train on, {len(capture.val)} to evaluate, {shown}"
+    )
     times = sorted(capture.cameras[name].time for name in capture.train)
     distinct = len(set(times))
     is_guessed = capture.time_source.problem and capture.assumption != "static"

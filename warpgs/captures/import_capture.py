@@ -13,7 +13,7 @@ from warpgs.data.capture import Capture, Frame
 from warpgs.data.lens import Lens
 from warpgs.data.tracks import write_tracks
 from warpgs.data.units import SceneUnits, depth_range
-from warpgs.errors import command
+from warpgs.errors import command, counted
 from warpgs.files import complete_or_absent
 
 from .opening import load_capture
@@ -60,8 +60,8 @@ def import_capture(
         _write_index(folder, capture, names, val)
     if log is not None:
         log(
-            f"{source} is read as {capture.layout}: {len(names)} frames, {counts[0]} with masks, "
-            f"{counts[1]} with depth, {len(val)} for evaluation, {len(capture.points)} points"
+            f"{source} is read as {capture.layout}: {counted(len(names), 'frame')}, {counts[0]} with masks, "
+            f"{counts[1]} with depth, {len(val)} for evaluation, {counted(len(capture.points), 'point')}"
         )
         _log_remarks(capture, renamed, log)
         log(f"{target} is finished: next run {command('check', target)}")

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
+from warpgs.data.tracks import ADD
 
 from .findings import Finding, Level
 
@@ -44,7 +45,10 @@ def check_tracks(capture: Capture, names: Sequence[str]) -> Iterator[Finding]:
         text += f"; {fits.mean():.0%} of the static ones fit the cameras"
         if fits.mean() < MIN_FITTING:
             level = "warning"
-            text += ": they may be of other frames than the capture has, or of frames of another size"
+            text += (
+                ": they may be of other frames than the capture has, or of frames of another size: track the frames in "
+                f"rgb/1x, then delete tracks.npz and run {ADD}"
+            )
     yield Finding(level, "tracks", text)
 
 

@@ -144,7 +144,7 @@ class Capture:
         conventions: What its files mean.
         is_builtin: Whether the package makes it: then no advice to change its files makes sense.
         metres: Metres per scene unit; None if that is not known.
-        tracks: Points that a network followed through the frames of ``film``; None without any.
+        read_tracks: Reads ``tracks``; None without any.
         notes: Remarks of the loader on files that it skipped or had to interpret, one sentence each.
         assumption: What is taken as dynamic; see ``assuming``.
         has_empty: Whether frames may say where they are empty: not over black; see ``over``.
@@ -171,7 +171,7 @@ class Capture:
     readout: float = 0.0
     readout_from: Side = "top"
     layout: str = ""
-    tracks: Tracks | None = None
+    read_tracks: Callable[[], Tracks | None] | None = None
     metres: float | None = None
     conventions: Conventions = field(default_factory=Conventions)
     assumption: Assumption = field(init=False)
@@ -207,6 +207,15 @@ class Capture:
     def __repr__(self) -> str:
         frames = f"{len(self.train)} frames to train on, {len(self.val)} to evaluate on"
         return f"<Capture {self.name}: {frames}, {len(self.points)} points>"
+
+    @cached_property
+    def tracks(self) -> Tracks | None:
+        """Points that a network followed through the frames of ``film``, read once; None without any.
+
+        Raises:
+            ValueError: If their file is damaged, or does not fit the frames.
+        """
+        return None if self.read_tracks is None else self.read_tracks()
 
     @cached_property
     def median_depth(self) -> float:

@@ -8,6 +8,7 @@ dense/1, …; other programs write the files next to images/.
 from pathlib import Path
 from typing import NamedTuple
 
+from warpgs.errors import counted
 from warpgs.files import natural_order, read_bounded
 
 from .colmap_files import MAX_BYTES, REQUIRED
@@ -64,7 +65,7 @@ def largest_model(root: Path) -> tuple[ModelFolder | None, list[str]]:
         return (found[0] if found else None), []
     counts = [model.num_images() for model in found]
     best = counts.index(max(counts))
-    shown = [f"{model.shown(root)} ({count} images)" for model, count in zip(found, counts, strict=True)]
+    shown = [f"{model.shown(root)} ({counted(count, 'image')})" for model, count in zip(found, counts, strict=True)]
     used = shown.pop(best)
     few, more = ", ".join(shown[:4]), f" and {len(shown) - 4} more" if len(shown) > 4 else ""
     rank = "the largest" if counts.count(max(counts)) == 1 else "the first of the largest"

@@ -16,6 +16,9 @@ from .npz import read_npz
 FILE = "tracks.npz"
 """Name of the file in a capture."""
 
+ADD = "warpgs prepare CAPTURE --add tracks --tracks FILE"
+"""The command that writes it."""
+
 MAX_BYTES = 2 << 30
 """Maximum size of the arrays [bytes]."""
 
@@ -60,11 +63,14 @@ def read_tracks(root: Path, frames: Sequence[str] | None) -> Tracks | None:
     path = root / FILE
     if not path.exists():
         return None
-    arrays = read_npz(path, ("tracks", "visibles", "size"), MAX_BYTES)
-    size = arrays["size"]
-    if size.shape != (2,) or not ((size >= 1) & (size <= MAX_SIDE)).all():
-        raise ValueError(f"{path}: size must be the width and height of the frames that tracks count pixels of")
-    return make_tracks(path, frames, arrays["tracks"], arrays["visibles"], (int(size[0]), int(size[1])))
+    try:
+        arrays = read_npz(path, ("tracks", "visibles", "size"), MAX_BYTES)
+        size = arrays["size"]
+        if size.shape != (2,) or not ((size >= 1) & (size <= MAX_SIDE)).all():
+            raise ValueError(f"{path}: size must be the width and height of the frames that tracks count pixels of")
+        return make_tracks(path, frames, arrays["tracks"], arrays["visibles"], (int(size[0]), int(size[1])))
+    except ValueError as error:
+        raise ValueError(f"{error}. Delete {FILE} to train without tracks, or add others with {ADD}") from error
 
 
 def make_tracks(
@@ -87,15 +93,19 @@ def make_tracks(
         ValueError: If shapes do not fit, or visible positions are not finite or mostly outside of the frames.
     """
     if frames is None:
-        raise ValueError(f"{path}: tracks are of one camera, but several cameras of the capture train")
+        raise ValueError(
+            f"{path}: tracks are of one camera, but several cameras of the capture train, which can have none"
+        )
     if positions.ndim != 3 or positions.shape[2] != 2 or visible.shape != positions.shape[:2]:
         shapes = f"{list(positions.shape)} and {list(visible.shape)}"
         raise ValueError(f"{path}: expected positions [N, F, 2] and visibility [N, F] of N points, got {shapes}")
     if positions.shape[1] != len(frames):
-        raise ValueError(f"{path}: tracks are of {positions.shape[1]} frames, but the camera has {len(frames)}")
+        raise ValueError(
+            f"{path}: tracks are of {positions.shape[1]} frames, but the camera has {len(frames)}: track all of these"
+        )
     seen = visible > VISIBLE
     if not np.isfinite(positions[seen]).all():
-        raise ValueError(f"{path}: positions of visible points must be finite numbers")
+        raise ValueError(f"{path}: positions of visible points must be finite numbers, or the points hidden there")
     relative = np.where(seen[..., None], positions, 0.0) / np.array(size, np.float64)
     inside = seen & ((relative >= 0.0) & (relative < 1.0)).all(2)
     if inside.sum() < (1.0 - MAX_OUTSIDE) * seen.sum():

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from warpgs.data.npz import names_of, read_npz
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.errors import counted
 from warpgs.files import write_bytes
 from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import evenly_spaced
@@ -77,7 +78,7 @@ class Objects(NamedTuple):
         counts = np.bincount(self.ids, minlength=len(self.names) + 1)[1:]
         listed = zip(range(1, len(counts) + 1), self.names, counts, strict=True)
         return ", ".join(
-            f"{k}{'' if name == str(k) else f' {name}'} ({count:,} Gaussians)" for k, name, count in listed
+            f"{k}{'' if name == str(k) else f' {name}'} ({counted(count, 'Gaussian')})" for k, name, count in listed
         )
 
 

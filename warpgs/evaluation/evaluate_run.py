@@ -10,6 +10,7 @@ from warpgs.config import Device, NetName
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.responses import camera_responses
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.errors import counted
 from warpgs.files import read_json, write_json, write_png
 from warpgs.rendering import Rendering
 from warpgs.runs.captures import require_same_times
@@ -121,7 +122,7 @@ def _write_video(path: Path, scene: TrainedScene, capture: Capture, quiet: bool)
 
 def _summary(values: dict[str, Any]) -> str:
     num_views = values["num_views"]
-    heads: dict[Line, str] = {"views": f"{num_views} view{'s' * (num_views != 1)}: ", "co-visible": "co-visible: "}
+    heads: dict[Line, str] = {"views": f"{counted(num_views, 'view')}: ", "co-visible": "co-visible: "}
     lines = [head + told for line, head in heads.items() if (told := _told(line, values))]
     if not num_views:
         lines = ["the capture has no evaluation frames: PSNR, SSIM and LPIPS not measured"]

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from warpgs.errors import counted
+
 from .camera_set import CameraSet
 from .colmap_model import write_colmap
 from .transforms_files import write_blender, write_nerfstudio
@@ -35,7 +37,8 @@ def write_cameras(folder: Path, name: str, cameras: CameraSet) -> str:
     if cameras.has_panoramas and not form.has_lens:
         raise ValueError(f"--cameras {name} holds pinholes, not panoramas: use --cameras nerfstudio or colmap")
     form.write(folder, cameras)
-    lines = [f"{len(cameras.cameras):,} cameras in {folder}, in the coordinates of the scene's file: {form.axes}"]
+    count = counted(len(cameras.cameras), "camera")
+    lines = [f"{count} in {folder}, in the coordinates of the scene's file: {form.axes}"]
     if cameras.is_distorted and not form.has_lens:
         lines.append(f"--cameras {name} holds pinholes: the distortion of the lens is not in it")
     if any(camera.motion is not None for camera in cameras.cameras.values()):

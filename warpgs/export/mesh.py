@@ -12,6 +12,7 @@ from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
 from warpgs.data.sampling import evenly_spaced
 from warpgs.editing.contribution import sample_cameras
+from warpgs.errors import counted
 from warpgs.files import remove_numbered
 from warpgs.formats.mesh import Mesh, write_mesh_ply
 from warpgs.formats.mesh_gltf import write_mesh_glb
@@ -62,12 +63,13 @@ def write_mesh(job: Job) -> str:
         raise ValueError(
             f"{options.run_folder}: no surface is opaque enough for a mesh in the training cameras"
             + (f", or none is as large as the voxels of --voxel {options.voxel:g}" if options.voxel else "")
+            + ": use --format ply or glb, which hold the Gaussians themselves"
         )
     if times and not count and options.voxel:
         raise ValueError(f"--voxel {options.voxel:g} is larger than what moves: use a smaller one, or --layers static")
-    summary = f"{0 if static is None else len(static.faces):,} static triangles"
+    summary = counted(0 if static is None else len(static.faces), "static triangle")
     if times:
-        summary += f" and {count:,} dynamic ones at {len(times)} {'time' if len(times) == 1 else 'times'}"
+        summary += f" and {count:,} dynamic ones at {counted(len(times), 'time')}"
     _remove_former(job)
     if options.frames is None:
         path = str(job.file(NAME))

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 
 from warpgs.command_line.progress import progress
+from warpgs.errors import counted
 from warpgs.files import remove_numbered
 from warpgs.formats.cloud import Cloud
 from warpgs.formats.rotation import rotated
@@ -43,8 +44,8 @@ def _write(suffix: str, write_cloud: Callable[[Path, Cloud], int], y_up: bool, j
             file = name + suffix if options.frames is None else _numbered(name, suffix, k)
             size += write_cloud(job.file(file), cloud.select(rows))
             num_files, max_count = num_files + 1, max(max_count, int(rows.sum()))
-    one, several = f"{job.file(file)}: {max_count:,} Gaussians", f"{num_files} files of up to {max_count:,} Gaussians"
-    written = one if num_files == 1 else f"{several} in {folder}"
+    count = counted(max_count, "Gaussian")
+    written = f"{job.file(file)}: {count}" if num_files == 1 else f"{num_files} files of up to {count} in {folder}"
     if options.frames is None:
         written += f" at time {times[0]:g} of 0 to 1"
     return f"{written}, {size / 1e6:.1f} MB\n{job.up_note}"

@@ -34,7 +34,7 @@ def write_mesh_glb(path: Path, static: Mesh | None, frames: Sequence[Mesh], seco
 
     Raises:
         OSError: If it cannot be written; the message names the file.
-        ValueError: If there are no triangles, or it takes more than 4 GB.
+        ValueError: If no mesh has triangles, or it takes more than 4 GB.
     """
     builder = _Builder()
     if static is not None and len(static.faces):
@@ -44,7 +44,7 @@ def write_mesh_glb(path: Path, static: Mesh | None, frames: Sequence[Mesh], seco
         builder.nodes.append({"name": "dynamic", "children": [node for _, node in shown]})
         builder.root.append(len(builder.nodes) - 1)
     if not builder.root:
-        raise ValueError(f"{path}: there are no triangles")
+        raise ValueError(f"{path}: the meshes have no triangles: use a smaller --voxel")
     if len(frames) > 1:
         for k, node in shown:
             builder.animate(node, k, np.arange(len(frames) + 1) * seconds / len(frames))

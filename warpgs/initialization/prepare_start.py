@@ -10,7 +10,7 @@ from warpgs.data.depth_alignment import typical_error
 from warpgs.data.dynamic_regions import dynamic_counts, unknown_depth
 from warpgs.data.empty_masks import wrongly_empty
 from warpgs.data.responses import camera_responses
-from warpgs.errors import command
+from warpgs.errors import command, counted
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime import ranks
 from warpgs.views.views import Views
@@ -37,9 +37,10 @@ def prepare_start(config: TrainConfig, capture: Capture) -> Start:
         capture: Capture to train on, as ``open_capture(config)`` reads it.
 
     Raises:
-        ValueError: If a training frame has no mask, is damaged, or has depth that the config excludes, or an option has
-            an unknown value or one that the capture does not suit.
+        ValueError: If a training frame has no mask, it or the tracks are damaged, or it has depth that the config
+            excludes, or an option has an unknown value or one that the capture does not suit.
     """
+    _ = capture.tracks  # what is damaged is refused now, not after the first stage; copies of the capture keep them
     plan, notes = make_plan(config, capture)
     return _with_remedies(_read(plan, capture, resumed=False).noted(*notes))
 
@@ -85,7 +86,7 @@ def _even_exposure(start: Start) -> Start:
     gains, notes, capture = exposure_gains(start.views), [], start.capture
     if count := int((gains != 1.0).any(1).sum()):
         low, high = gains.min().item(), gains.max().item()
-        notes.append(f"exposure jumps: {count} frames are divided by {low:.2f} to {high:.2f}")
+        notes.append(f"exposure jumps: {counted(count, 'frame')} divided by {low:.2f} to {high:.2f}")
     trained, responses = {*capture.by_camera(capture.train)}, camera_responses(capture)
     for i, response in responses.items():
         told = f"{response} (red, green, blue)"
@@ -110,7 +111,8 @@ def _follow_tracks(start: Start) -> Start:
     """Has dynamic Gaussians start on the tracks of objects that move far from frame to frame."""
     tracks = find_tracks(start.capture, start.views) if start.plan.model.tracks else []
     if tracks:
-        note = f"{len(tracks)} objects move far from frame to frame: dynamic Gaussians start on their tracks"
+        objects = counted(len(tracks), "object")
+        note = f"dynamic Gaussians start on the tracks of {objects}, which move far from frame to frame"
         return start.planned(for_tracks(start.plan, tracks)).noted(note)
     if start.plan.model.deformation == "splines":
         raise ValueError('model.deformation "splines": no small objects are tracked in this capture; use "mlp"')

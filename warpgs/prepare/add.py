@@ -4,14 +4,14 @@ The methods of ``MASKERS`` and ``DEPTHS`` work on the frames of one camera, with
 own, they are resampled to one pinhole camera, and results to each frame as its file has it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from warpgs.captures.opening import load_capture
 from warpgs.command_line.progress import progress
@@ -31,7 +31,7 @@ from warpgs.data.results.tracks import read_tracked_points
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.tracks import FILE, make_tracks, read_tracks, write_tracks
 from warpgs.data.units import SceneUnits, read_units
-from warpgs.errors import not_one_of
+from warpgs.errors import counted, not_one_of
 from warpgs.files import read_json, write_json
 from warpgs.locks import lock_folder
 
@@ -143,7 +143,8 @@ class _Job:
             if len(video) < MIN_FOR_MOTION and self.options.masks in MASKERS:
                 whose = f" of the camera of {video[0]}" if len(videos) > 1 else ""
                 raise ValueError(
-                    f"{len(video)} frames{whose} are too few to find what moves, at least {MIN_FOR_MOTION} are needed"
+                    f"{len(video)} frames{whose} are too few to find what moves, at least {MIN_FOR_MOTION} are needed: "
+                    "give masks of what moves (--masks FOLDER)"
                 )
         sheets, fractions = [], list[float]()
         for video in lacking:
@@ -154,7 +155,7 @@ class _Job:
             fractions += [float(mask.mean()) for mask in masks]
         write_contact_sheet(self.root / "masks.png", sheets)
         fraction = np.mean(fractions)
-        self._say(f"masks: {len(missing)} frames, {fraction:.1%} of the pixels move: look at masks.png")
+        self._say(f"masks: {counted(len(missing), 'frame')}, {fraction:.1%} of the pixels move: look at masks.png")
 
     def _estimate_masks(self, video: list[str], missing: set[str]) -> DynamicMasks:
         """The masks of a camera's frames at working size, of which those of the ``missing`` ones are written."""
@@ -178,9 +179,11 @@ class _Job:
     def _copy_masks(self, video: list[str], missing: set[str]) -> DynamicMasks:
         """The same from the file or folder of a network."""
         images, masks = self._posed(video, WORKING_SIDE).images, []
-        found = [*read_masks(Path(self.options.masks), video, self._sizes(video))]
+        given = Path(self.options.masks), video, self._sizes(video)
+        for _ in read_masks(*given):
+            pass  # all are valid before the first is written; in full size, they do not fit in memory together
         self._keep_layout_of_estimates(missing)
-        for name, image, mask in zip(video, images, found, strict=True):
+        for name, image, mask in zip(video, images, read_masks(*given), strict=True):
             if name in missing:
                 writer.write_mask(self.root, name, ~mask, self._factors())
             masks.append(~resize_mask(~mask, image.shape[1::-1]))
@@ -229,7 +232,7 @@ class _Job:
                 full = cv2.resize(static, (lens.width, lens.height), interpolation=cv2.INTER_NEAREST) > 0
                 writer.write_mask(self.root, name, full, lacking)
         if completed:
-            self._say(f"masks: {completed} frames had them in some sizes only")
+            self._say(f"masks: {counted(completed, 'frame')} had them in some sizes only")
 
     def add_depth(self) -> None:
         """Writes depth of the frames that lack it, and depth.png; not of iPhone captures, whose depth is in metres."""
@@ -243,33 +246,37 @@ class _Job:
             return
         seen_apart = self._seen_apart(videos, self.options.depth) if self.options.depth in DEPTHS else videos
         chosen = [video for video in seen_apart if not missing.isdisjoint(video)]
-        sheets, known = [], list[float]()
+        sheets, known = list[dict[str, UInt8[np.ndarray, "H W 3"]]](), list[float]()
         for video in chosen:
-            planes = self._planes(video)
-            for name, plane in zip(video, planes, strict=True):
+            shown = {video[k] for k in choose_evenly(len(video), len(chosen))}
+            sheets.append({})
+            for name, plane in zip(video, self._planes(video), strict=True):
                 if name in missing:
                     writer.write_depth(self.root, name, as_half(plane))
-            shown = choose_evenly(len(video), len(chosen))
-            sheets.append({video[k]: colored_depth(planes[k]) for k in shown})
-            known += [float(np.isfinite(plane).mean()) for plane in planes]
+                if name in shown:
+                    sheets[-1][name] = colored_depth(plane)
+                known.append(float(np.isfinite(plane).mean()))
         if not chosen:
             self._say("depth: all frames of cameras that move have it")
             return
         write_contact_sheet(self.root / "depth.png", sheets)
         count = len(missing & {name for video in chosen for name in video})
-        self._say(f"depth: {count} frames, known on {np.mean(known):.0%} of the pixels: look at depth.png")
+        self._say(f"depth: {counted(count, 'frame')}, known on {np.mean(known):.0%} of the pixels: look at depth.png")
 
-    def _planes(self, video: list[str]) -> list[Float[np.ndarray, "H W"]]:
+    def _planes(self, video: list[str]) -> Iterator[Float[np.ndarray, "H W"]]:
         """Inverse depth of a camera's frames, estimated or from the file or folder of a network."""
         if self.options.depth not in DEPTHS:
-            return [*read_depths(Path(self.options.depth), video, self._sizes(video))]
+            given = Path(self.options.depth), video, self._sizes(video)
+            for _ in read_depths(*given):
+                pass  # as for masks
+            yield from read_depths(*given)
+            return
         frames, _, planes = self._depth(video, self.options.depth)
-        width, found = frames.lens.width, []
+        width = frames.lens.width
         for name, plane in zip(video, planes, strict=True):
             lens = self._lens(name)
             lens = lens.resized(width, round(width * lens.height / lens.width))
-            found.append(resampled(plane, frames.lens, lens, cv2.INTER_NEAREST))
-        return found
+            yield resampled(plane, frames.lens, lens, cv2.INTER_NEAREST)
 
     def add_tracks(self) -> None:
         """Writes tracks.npz from the file of a network, if the capture has no tracks."""

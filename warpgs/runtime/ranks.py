@@ -25,7 +25,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from warpgs.errors import FAILED, INTERRUPTED, say
+from warpgs.errors import FAILED, INTERRUPTED, counted, say
 
 TIMEOUT_MINUTES = 10
 """How long a rank waits for the others, as for callbacks and checkpoints of rank 0, before it gives up [minutes]."""
@@ -126,7 +126,7 @@ def use_device(device: str) -> None:
     here, gpus = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()
     if here > gpus:
         raise ValueError(
-            f"torchrun started {here} processes on this machine, where torch sees {gpus} GPU{'s' * (gpus != 1)}: "
+            f"torchrun started {here} processes on this machine, where torch sees {counted(gpus, 'GPU')}: "
             f"expected --nproc-per-node of at most {gpus}"
         )
     if not dist.is_nccl_available():

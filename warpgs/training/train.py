@@ -14,7 +14,7 @@ from warpgs.captures.opening import open_capture
 from warpgs.command_line.interrupt import Interrupt
 from warpgs.config import Device, TrainConfig, extended, scaled
 from warpgs.data.capture import Capture
-from warpgs.errors import command, is_out_of_memory
+from warpgs.errors import command, counted, is_out_of_memory
 from warpgs.evaluation.evaluate import check_views
 from warpgs.evaluation.evaluate_run import evaluate_run
 from warpgs.evaluation.held_out import HeldOut
@@ -107,7 +107,7 @@ def _evaluate(trainer: Trainer, log: Log | None) -> None:
     capture = trainer.capture.assuming("masks")  # evaluation needs the true masks
     if capture.val:
         # Without a terminal, there is no progress bar for minutes.
-        log(f"evaluating {len(capture.val)} view{'s' * (len(capture.val) != 1)}")
+        log(f"evaluating {counted(len(capture.val), 'view')}")
     lpips = [] if config.lpips is None else ["--lpips", str(config.lpips), "--lpips-net", config.lpips_net]
     later = f"run it with {command('eval', trainer.run, *lpips)}"
     try:
@@ -163,7 +163,7 @@ def _describe(trainer: Trainer, log: Log) -> None:
     layout = "" if config.data is None else f" (read as {trainer.capture.layout})"
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     resumed = f", after iteration {trainer.iteration} of {trainer.protocol.num_iterations}" * (trainer.iteration > 0)
-    views = f"{num_views} view{'s' * (num_views != 1)}"
+    views = counted(num_views, "view")
     log(f"{name}{layout}: {views}, on {config.device}{together}, into {trainer.run}{resumed}")
     for note in trainer.notes:
         log(note)

@@ -14,6 +14,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, missing_view
 from warpgs.editing.edited_scene import with_edits
+from warpgs.errors import counted
 from warpgs.files import remove_numbered, write_png
 from warpgs.runs.opening import open_scene
 from warpgs.runs.run import Run
@@ -189,7 +190,7 @@ def _write(options: Render, folder: Path, names: list[str], images: Iterator[np.
                 write_png(folder / f"{name}.png", image)
     height, width = image.shape[:2]
     written = [*([folder] if with_images else []), *([file] if video else [])]
-    return f"{len(names)} images of {width} × {height} in {' and '.join(map(str, written))}"
+    return f"{counted(len(names), 'image')} of {width} × {height} in {' and '.join(map(str, written))}"
 
 
 def _add(video: writer.Video, image: np.ndarray) -> None:

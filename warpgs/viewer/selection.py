@@ -11,6 +11,7 @@ from jaxtyping import Bool, Int64
 
 from warpgs.editing.contribution import blend_weights_in
 from warpgs.editing.marked import Marked
+from warpgs.errors import counted
 from warpgs.runs.trained import TrainedScene
 
 from . import marks
@@ -130,7 +131,7 @@ class Selection:
         if is_closed:
             self._select(lambda size: marks.polygon(size, corners), event.modifier)
         else:
-            self._editor.say(f"lasso of {len(self._corners)} corners: click at the first one to close it")
+            self._editor.say(f"lasso of {counted(len(self._corners), 'corner')}: click at the first one to close it")
 
     def _select(self, area_of: Callable[[tuple[int, int]], Area], modifier: str | None) -> None:
         """Adds the shown Gaussians in an area of the image to the selection, or removes them from it."""

@@ -4,6 +4,7 @@ To add a dataset, write a ``Loader`` in a new file, add a line to ``LOADERS`` an
 Nerfies derive theirs from ``nerfies.NerfiesLoader``; ``Loader`` itself requires no layout.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -96,7 +97,7 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     _require_sides(root, capture)
     capture = with_camera_ids(with_image_circle(capture))
     capture.layout = describe_layout(root, layout, dataset)
-    capture.tracks = read_tracks(root, capture.film)
+    capture.read_tracks = partial(read_tracks, root, capture.film)
     try:
         readout = capture.readout if options.readout is None else options.readout
         return with_readout(capture, readout, options.readout_from or capture.readout_from)

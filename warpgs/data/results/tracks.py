@@ -107,4 +107,6 @@ def _without_batch(array: Shaped[np.ndarray, "..."], ndim: int) -> Shaped[np.nda
 def _require_shapes(path: Path, tracks: np.ndarray, visible: np.ndarray) -> None:
     if tracks.ndim != 3 or tracks.shape[2] != 2 or visible.shape != tracks.shape[:2]:
         shapes = f"{list(tracks.shape)} and {list(visible.shape)}"
-        raise ValueError(f"{path}: tracks and visibility do not fit each other, got shapes {shapes}")
+        raise ValueError(
+            f"{path}: tracks and visibility do not fit each other, got shapes {shapes}: save both arrays of one call"
+        )

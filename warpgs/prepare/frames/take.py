@@ -16,7 +16,7 @@ from warpgs.data.images import MAX_SIDE, decode
 from warpgs.data.loaders.name_times import times_of_names
 from warpgs.data.optical_flow import MAX_ASPECT, MIN_SIDE
 from warpgs.data.time_source import TimeSource
-from warpgs.errors import similar_path
+from warpgs.errors import counted, similar_path
 from warpgs.files import natural_order, read_json, write_json, write_png
 
 from ..options import MAX_FRAMES, MIN_FRAMES, Selection
@@ -205,9 +205,7 @@ def take_frames(
         taken.append(SourceFrame(f"{prefix}_{len(taken):06d}", found.origin, found.step, found.time))
         write_png(folder / f"{taken[-1].name}.png", image)
     if len(taken) < MIN_FRAMES:
-        raise ValueError(
-            f"{source} gives {len(taken)} frame{'s' * (len(taken) != 1)}, at least {MIN_FRAMES} are needed"
-        )
+        raise ValueError(f"{source} gives {counted(len(taken), 'frame')}, at least {MIN_FRAMES} are needed")
     height, width = image.shape[:2]
     size, factor = (width, height), max(width, height) / found.longest_side
     frames = Frames(folder, taken, *size, factor, str(source), readout_from=found.readout_from)
