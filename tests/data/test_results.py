@@ -132,6 +132,30 @@ def test_ids_of_a_palette_are_objects_and_0_is_static(tmp_path, dynamic):
     np.testing.assert_array_equal(read_object_mask(tmp_path / "a.png", SIZE), dynamic[1])
 
 
+def test_ids_are_told_apart_by_their_numbers_not_by_their_colours(tmp_path, dynamic):
+    write_with_palette(tmp_path / "a.png", np.where(dynamic[1], 1, 0), [[0, 0, 0], [0, 0, 0], [0, 128, 0]])
+    np.testing.assert_array_equal(read_object_mask(tmp_path / "a.png", SIZE), dynamic[1])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [((0, 3), "has levels of 0 to 3, but no palette"), (([0, 0, 0], [0, 0, 128]), "has colours, but no palette")],
+)
+def test_ids_without_a_palette_are_refused(tmp_path, dynamic, values, message):
+    static, moving = (np.array(value, np.uint8) for value in values)
+    mask = np.where(dynamic[1][..., None] if moving.ndim else dynamic[1], moving, static)
+    cv2.imwrite(str(tmp_path / "a.png"), mask)
+    with pytest.raises(ValueError, match=message):
+        read_object_mask(tmp_path / "a.png", SIZE)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_a_mask_with_soft_edges_or_of_jpeg_is_dynamic_where_it_is_dark(tmp_path, dynamic, suffix):
+    soft = cv2.GaussianBlur(np.where(dynamic[1], 0, 255).astype(np.uint8), (3, 3), 0)
+    cv2.imwrite(str(tmp_path / f"a.{suffix}"), cv2.cvtColor(soft, cv2.COLOR_GRAY2BGR))
+    assert (read_object_mask(tmp_path / f"a.{suffix}", SIZE) == dynamic[1]).mean() > 0.97
+
+
 def test_a_palette_of_black_and_white_is_0_where_dynamic(tmp_path, dynamic):
     write_with_palette(tmp_path / "a.png", np.where(dynamic[1], 0, 1), [[0, 0, 0], [255, 255, 255]])
     np.testing.assert_array_equal(read_object_mask(tmp_path / "a.png", SIZE), dynamic[1])

@@ -100,8 +100,11 @@ def image_size(path: Path) -> tuple[int, int]:
     return _read_checked(path, MAX_PIXELS)[1]
 
 
-def palette_of(path: Path) -> UInt8[np.ndarray, "K 3"] | None:
-    """The colours of the palette of a PNG file; None if it is a file without one; raises as ``decode``."""
+def indices_of(path: Path) -> UInt8[np.ndarray, "H W"] | None:
+    """The indices of a PNG file with a palette of colours; None of greys or of another file; raises as ``decode``.
+
+    OpenCV gives colours only, of which several indices may have one: it gets a palette of greys, one for each index.
+    """
     data = _read_checked(path, MAX_PIXELS)[0]
     if not data.startswith(_PNG) or data[_PNG_COLOR_TYPE : _PNG_COLOR_TYPE + 1] != b"\x03":
         return None
@@ -109,7 +112,13 @@ def palette_of(path: Path) -> UInt8[np.ndarray, "K 3"] | None:
     if start < 0:
         raise ValueError(f"{path} is damaged: it has no palette for its indices of colours")
     length = int.from_bytes(data[start - 4 : start], "big")
-    return np.frombuffer(data, np.uint8, length - length % 3, start + 4).reshape(-1, 3)
+    palette = np.frombuffer(data, np.uint8, length - length % 3, start + 4).reshape(-1, 3)
+    if (palette == palette[:, :1]).all():
+        return None
+    chunk = b"PLTE" + np.repeat(np.arange(len(palette), dtype=np.uint8), 3).tobytes()
+    chunk += zlib.crc32(chunk).to_bytes(4, "big")
+    rest = data[start + 4 + length + 4 :]
+    return _decode(path, data[: start - 4] + (len(chunk) - 8).to_bytes(4, "big") + chunk + rest, cv2.IMREAD_GRAYSCALE)
 
 
 def is_transparent(path: Path) -> bool:

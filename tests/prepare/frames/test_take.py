@@ -92,25 +92,53 @@ def test_large_images_are_scaled_down_and_small_ones_kept_as_the_list_of_frames_
     assert np.array_equal(decode(tmp_path / "large/frame_000000.png")[..., ::-1], images[0])
 
 
-def test_an_image_is_rotated_by_its_orientation_tag(tmp_path, images):
-    entry = struct.pack(">HHIHH", 0x0112, 3, 1, 6, 0)
+def write_tagged(path, image, orientation):
+    """A JPEG file with an EXIF orientation."""
+    entry = struct.pack(">HHIHH", 0x0112, 3, 1, orientation, 0)
     exif = b"Exif\0\0" + b"MM\0*" + struct.pack(">IH", 8, 1) + entry + struct.pack(">I", 0)
+    jpeg = cv2.imencode(".jpg", image)[1].tobytes()
+    path.write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:])
+
+
+def brightest_side(path):
+    image = decode(path).astype(float)
+    edges = {"top": image[:8], "bottom": image[-8:], "left": image[:, :8], "right": image[:, -8:]}
+    return max(edges, key=lambda edge: edges[edge].mean())
+
+
+def with_bright_top(images):
+    bright = [image.copy() for image in images]
+    for image in bright:
+        image[: image.shape[0] // 4] = 255
+    return bright
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_an_image_is_rotated_by_its_orientation_tag(tmp_path, images, orientation):
+    for k, image in enumerate(with_bright_top(images[:5])):
+        write_tagged(tmp_path / f"{k}.jpg", image, orientation)
+    notes = []
+    frames = take_frames(tmp_path, tmp_path / "frames", Selection(), notes=notes)
+    turn = -1 if orientation >= 5 else 1
+    assert decode(tmp_path / "frames/frame_000000.png").shape[:2] == images[0].shape[:2][::turn]
+    assert Frames.load(tmp_path / "frames").readout_from == frames.readout_from
+    assert brightest_side(tmp_path / "frames/frame_000000.png") == frames.readout_from
+    assert notes == []
+
+
+def test_frames_that_were_held_differently_are_noted(tmp_path, images):
     for k in range(5):
-        jpeg = cv2.imencode(".jpg", images[k])[1].tobytes()
-        tagged = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
-        (tmp_path / f"{k}.jpg").write_bytes(tagged)
-    take_frames(tmp_path, tmp_path / "frames", Selection())
-    assert decode(tmp_path / "frames/frame_000000.png").shape[:2] == images[0].shape[1::-1]
+        write_tagged(tmp_path / f"{k}.jpg", images[k], 8 if k in (1, 4) else 6)
+    notes = []
+    assert take_frames(tmp_path, tmp_path / "frames", Selection(), notes=notes).readout_from == "right"
+    assert "2 frames of 5 were filmed with the camera held differently" in notes[0]
 
 
 @pytest.mark.parametrize(
     ("turn", "side"), [((0, 1, -1, 0), "right"), ((-1, 0, 0, -1), "bottom"), ((0, -1, 1, 0), "left"), (None, "top")]
 )
 def test_a_rotation_tag_says_where_the_first_row_of_the_sensor_is(turn, side, tmp_path, images):
-    bright = [image.copy() for image in images[:8]]
-    for image in bright:
-        image[: image.shape[0] // 4] = 255
-    data = write_video(tmp_path / "video.mp4", bright).read_bytes()
+    data = write_video(tmp_path / "video.mp4", with_bright_top(images[:8])).read_bytes()
     if turn is not None:
         a, b, c, d = (entry * (1 << 16) for entry in turn)
         track = data.index(b"tkhd")
@@ -119,9 +147,7 @@ def test_a_rotation_tag_says_where_the_first_row_of_the_sensor_is(turn, side, tm
     (tmp_path / "tagged.mp4").write_bytes(data)
     frames = take_frames(tmp_path / "tagged.mp4", tmp_path / "frames", Selection())
     assert Frames.load(tmp_path / "frames").readout_from == frames.readout_from == side
-    image = decode(tmp_path / "frames/frame_000000.png").astype(float)
-    edges = {"top": image[:8], "bottom": image[-8:], "left": image[:, :8], "right": image[:, -8:]}
-    assert max(edges, key=lambda edge: edges[edge].mean()) == side
+    assert brightest_side(tmp_path / "frames/frame_000000.png") == side
 
 
 def test_a_video_is_rotated_by_its_rotation_tag(tmp_path, images):

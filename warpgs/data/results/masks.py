@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Shaped
 
-from warpgs.data.images import decode, palette_of
+from warpgs.data.images import decode, indices_of
 from warpgs.data.loaders.listed import find_file
 from warpgs.data.npz import names_of, read_npz
 from warpgs.data.resized import check_shape, read_resized_mask, resize_mask
@@ -14,21 +14,40 @@ from warpgs.data.resized import check_shape, read_resized_mask, resize_mask
 ARRAYS = ("masks", "out_binary_masks")
 """Names of the array of masks: [F, H, W], or with axes of objects before the last two."""
 
+MAX_ID = 127
+"""Largest value of a file of 8 bits that is dark everywhere; if something is brighter than 1, it shows ids."""
+
+MAX_CHROMA = 64
+"""Difference of a pixel's channels up to which it is grey, as images that were compressed are."""
+
 
 def read_object_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
     """True where a mask file is dynamic, resized to ``size`` (width, height): any part of a pixel is.
 
-    A PNG file with a palette of colours holds ids of objects, and 0 where static; any other one is 0 where dynamic.
+    A PNG file with a palette of colours holds ids of objects, and 0 where static, whatever the colours are; any other
+    one is 0 where dynamic.
 
     Raises:
-        ValueError: If it is damaged, or of another shape.
+        ValueError: If it is damaged, of another shape, or seems to hold ids without a palette.
     """
-    palette = palette_of(path)
-    if palette is None or (palette == palette[:, :1]).all():
+    ids = indices_of(path)
+    if ids is None:
+        _refuse_ids(path, decode(path))
         return ~read_resized_mask(path, size)
-    stored = decode(path)[..., :3]
-    check_shape(path, "the mask", (stored.shape[1], stored.shape[0]), size)
-    return ~resize_mask((stored == palette[0, ::-1]).all(2), size)
+    check_shape(path, "the mask", (ids.shape[1], ids.shape[0]), size)
+    return ~resize_mask(ids == 0, size)
+
+
+def _refuse_ids(path: Path, stored: Shaped[np.ndarray, "H W ..."]) -> None:
+    """Raises ValueError if a file without a palette seems to have ids of objects, by levels or by colours."""
+    levels = np.unique(stored[..., 0] if stored.ndim == 3 else stored)
+    has_colors = stored.ndim == 3 and stored.shape[2] > 2 and int(np.ptp(stored[..., :3], axis=2).max()) > MAX_CHROMA
+    if has_colors or 1 < levels[-1] <= MAX_ID:
+        what = "colours" if has_colors else f"levels of {levels[0]} to {levels[-1]}"
+        raise ValueError(
+            f"{path} has {what}, but no palette that says which object has which id: store it with a palette, or with "
+            "0 where something moves and 255 elsewhere"
+        )
 
 
 def read_masks(path: Path, names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Iterator[Bool[np.ndarray, "H W"]]:

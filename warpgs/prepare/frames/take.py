@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 
 from warpgs.command_line.progress import progress
 from warpgs.data.capture import SIDES, Side
+from warpgs.data.exif import orientation_of
 from warpgs.data.images import MAX_SIDE, decode
 from warpgs.data.loaders.name_times import times_of_names
 from warpgs.data.optical_flow import MAX_ASPECT, MIN_SIDE
@@ -38,6 +39,10 @@ PREFIX = "frame"
 
 MAX_TIME = 2**53
 """Maximum of a time, so that double precision represents it."""
+
+
+FIRST_ROW: tuple[Side, ...] = ("top", "top", "bottom", "bottom", "left", "right", "right", "left")
+"""Where the first stored row of an image is once it is upright, of each EXIF orientation from 1 on."""
 
 
 @dataclass(frozen=True)
@@ -197,9 +202,10 @@ def take_frames(
     images = (
         read_folder(source, selection, quiet, notes) if source.is_dir() else read_video(source, selection, quiet, notes)
     )
-    taken: list[SourceFrame] = []
+    taken, sides = list[SourceFrame](), list[Side]()
     size: tuple[int, int] | None = None
     for found in images:
+        sides.append(found.readout_from)
         size = size or found.image.shape[1::-1]
         image = _checked(found.image, f"{source}: {found.origin}", size, selection.longest_side)
         taken.append(SourceFrame(f"{prefix}_{len(taken):06d}", found.origin, found.step, found.time))
@@ -208,9 +214,20 @@ def take_frames(
         raise ValueError(f"{source} gives {counted(len(taken), 'frame')}, at least {MIN_FRAMES} are needed")
     height, width = image.shape[:2]
     size, factor = (width, height), max(width, height) / found.longest_side
-    frames = Frames(folder, taken, *size, factor, str(source), readout_from=found.readout_from)
+    frames = Frames(folder, taken, *size, factor, str(source), readout_from=_common_side(sides, str(source), notes))
     frames.save()
     return frames
+
+
+def _common_side(sides: Sequence[Side], source: str, notes: list[str]) -> Side:
+    """The side of most frames; a note for the user if others have another one."""
+    side = max(dict.fromkeys(sides), key=sides.count)
+    if (others := len(sides) - sides.count(side)) > 0:
+        notes.append(
+            f"{source}: {counted(others, 'frame')} of {len(sides)} {'was' if others == 1 else 'were'} filmed with the "
+            f"camera held differently; a rolling shutter (--readout) begins at the {side} of the others"
+        )
+    return side
 
 
 def take_videos(
@@ -281,7 +298,9 @@ def read_folder(source: Path, selection: Selection, quiet: bool, notes: list[str
     groups = np.array_split(np.arange(len(paths)), count)
     for group in progress(groups, "frames", quiet):
         best = max(((k, _read(paths[k])) for k in group), key=lambda c: sharpness(c[1]) if len(group) > 1 else 0)
-        yield TakenImage(int(best[0]), times[best[0]], paths[best[0]].name, best[1], max(best[1].shape[:2]))
+        path, image = paths[best[0]], best[1]
+        side = FIRST_ROW[orientation_of(path) - 1]
+        yield TakenImage(int(best[0]), times[best[0]], path.name, image, max(image.shape[:2]), side)
 
 
 def _in_order_of_time(paths: Sequence[Path], notes: list[str]) -> tuple[list[Path], list[int]]:
