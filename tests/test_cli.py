@@ -18,7 +18,9 @@ from warpgs.config import TrainConfig
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)], ids=str)
 def test_every_command_says_the_version(command, capsys):
     assert main([*command, "--version"]) == 0
-    assert capsys.readouterr().out == f"warpgs {importlib.metadata.version('warpgs')}\n"
+    first, second = capsys.readouterr().out.splitlines()
+    assert first == f"warpgs {importlib.metadata.version('warpgs')}"
+    assert second.startswith("cpu: kernels for it are ") or second.startswith("cuda (")
 
 
 def shown(capsys, *arguments):
@@ -145,12 +147,17 @@ def test_positional_arguments_have_names(command, metavars, capsys):
         (["train", "--iterations", "x"], "warpgs train: error parsing --iterations: expected INT, got 'x'"),
         (
             ["train", "--model.appearance-size", "4"],
-            "warpgs train: error parsing --model.appearance-size: expected INT INT, got '4'\n",
+            "warpgs train: --model.appearance-size needs 2 values, INT INT; got 4\n",
         ),
         (["train", "--no-dap"], "warpgs train: there is no option --no-dap any more: --omit dap omits it\n"),
         (
             ["render", "r", "--freeze", "1", "abc"],
-            "warpgs render: error parsing --freeze: expected NAME FLOAT, got '1', 'abc'\n",
+            "warpgs render: --freeze needs 2 values, NAME TIME, of which TIME is a number; got abc\n",
+        ),
+        (["view", "r", "--freeze", "1"], "warpgs view: --freeze needs 2 values, NAME TIME; got fewer\n"),
+        (
+            ["export", "r", "--crop", "1", "2", "3"],
+            "warpgs export: --crop needs 6 values, X Y Z X Y Z; got 1 2 3\n",
         ),
         (["report", "r", "--views", "x"], "warpgs report: error parsing --views: expected INT, got 'x'"),
         (["prepare", "v", "c", "--start", "x"], "warpgs prepare: error parsing --start: expected FLOAT, got 'x'"),

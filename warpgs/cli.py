@@ -90,7 +90,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(wrapped(usage()))
         return 0
     if name == "--version" or rest == ["--version"]:
-        print(f"warpgs {version()}")
+        print(f"warpgs {version()}", flush=True)
+        with ending_at_once():
+            from .runtime.devices import choose_device
+            from .runtime.machine import described, kernels_note
+        device = choose_device()
+        print(f"{described(device)}: {kernels_note(device)}")
         return 0
     if name.startswith("--tyro"):
         return _print_completion(arguments)

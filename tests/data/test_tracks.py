@@ -132,7 +132,7 @@ def test_tracks_of_another_number_of_frames_are_refused(tmp_path, seen):
 
 def test_tracks_of_several_cameras_are_refused(tmp_path, seen):
     write_tracks(tmp_path, *seen, SIZE)
-    with pytest.raises(ValueError, match="several cameras of the capture train"):
+    with pytest.raises(ValueError, match="of this capture several train"):
         read_tracks(tmp_path, None)
 
 

@@ -202,7 +202,7 @@ def test_a_given_list_of_objects_replaces_a_saved_one_of_another_checkpoint(tmp_
     [
         (Edits(objects="1", recolor=(("2", 1.0, 0.0, 0.0),)), Edits(), "--recolor 2 would change nothing"),
         (Edits(freeze=(("2", 0.5),)), Edits(objects="0, 1"), "because --objects 0, 1 removes it: add 2 to --objects"),
-        (Edits(shift=(("2", 0.5),)), Edits(remove="1,2"), "because --remove 1,2 removes it"),
+        (Edits(shift=(("2", 0.5),)), Edits(remove="1,2"), "because --remove 1,2 removes it: omit 2 there"),
     ],
 )
 def test_a_change_of_an_object_that_is_removed_is_refused(tmp_path, scene, given, saved, message):

@@ -129,7 +129,7 @@ def test_masks_are_known_as_estimates_if_the_next_part_fails(root, monkeypatch):
 def test_masks_of_one_size_in_a_folder_that_gets_no_new_ones_are_refused(root):
     for name in NAMES:
         captures.write_png(root / f"mask/2x/{name}.png.png", STATIC[::2, ::2])
-    with pytest.raises(ValueError, match=r"has its masks in mask/, but new ones go to resized_mask/: rename"):
+    with pytest.raises(ValueError, match=r"has masks in mask/, but new ones go to resized_mask/: rename"):
         add_parts(root, AddOptions(["masks"], masks="red"))
 
 
@@ -154,7 +154,7 @@ def test_masks_are_not_split_over_two_folders(root):
     for name in train:
         write_mask(root, name)
     (root / "resized_mask").rename(root / "mask")
-    with pytest.raises(ValueError, match=r"has its masks in mask/, but new ones go to resized_mask/: rename"):
+    with pytest.raises(ValueError, match=r"has masks in mask/, but new ones go to resized_mask/: rename"):
         add_parts(root, AddOptions(["masks"], masks="red"))
     assert not (root / "resized_mask").exists()
     (root / "mask").rename(root / "resized_mask")

@@ -153,7 +153,7 @@ def one_line_errors(
             yield
     except SystemExit as end:
         if end.code:
-            raise ValueError(_unboxed(box.getvalue())) from None
+            raise ValueError(_with_places(options, _unboxed(box.getvalue()))) from None
         help_text = EMPTY_ROW.sub("", text.getvalue())
         sys.stdout.write(wrapped(help_text))  # tyro wraps its boxes, but not what precedes them
         raise
@@ -186,6 +186,28 @@ def _unboxed(text: str) -> str:
     for pattern, replacement in REWORDED:
         message = re.sub(pattern, replacement, message)
     return message[:1].lower() + message[1:]
+
+
+def _with_places(options: type, message: str) -> str:
+    """A message about an option of several values with what its help calls them: NAME TIME."""
+    found = re.fullmatch(r"(?:missing value for|error parsing) (--\S+?)(?:: expected ([A-Z ]+), got (.*))?", message)
+    metavars = {option.name: option.metavar.split() for option in documented(options)} if found else {}
+    if not found or len(places := metavars.get(found[1], [])) < 2:
+        return message
+    needs = f"{found[1]} needs {len(places)} values, {' '.join(places)}"
+    types, given = (found[2] or "").split(), [text.strip("'\"") for text in (found[3] or "").split(", ")]
+    if len(types) != len(places) or len(given) != len(places):
+        return f"{needs}; got {' '.join(given) or 'fewer'}"
+    wrong = (k for k, kind in enumerate(types) if kind in ("INT", "FLOAT") and not _is_number(given[k]))
+    return next((f"{needs}, of which {places[k]} is a number; got {given[k]}" for k in wrong), message)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def flags(options: type, prefix: str = "") -> Iterator[str]:

@@ -93,16 +93,13 @@ def make_tracks(
         ValueError: If shapes do not fit, or visible positions are not finite or mostly outside of the frames.
     """
     if frames is None:
-        raise ValueError(
-            f"{path}: tracks are of one camera, but several cameras of the capture train, which can have none"
-        )
+        raise ValueError(f"{path}: tracks are of one camera, but of this capture several train: it can have none")
     if positions.ndim != 3 or positions.shape[2] != 2 or visible.shape != positions.shape[:2]:
         shapes = f"{list(positions.shape)} and {list(visible.shape)}"
         raise ValueError(f"{path}: expected positions [N, F, 2] and visibility [N, F] of N points, got {shapes}")
     if positions.shape[1] != len(frames):
-        raise ValueError(
-            f"{path}: tracks are of {positions.shape[1]} frames, but the camera has {len(frames)}: track all of these"
-        )
+        counts = f"of {positions.shape[1]} frames, but the camera has {len(frames)}"
+        raise ValueError(f"{path}: tracks are {counts}: track all of these")
     seen = visible > VISIBLE
     if not np.isfinite(positions[seen]).all():
         raise ValueError(f"{path}: positions of visible points must be finite numbers, or the points hidden there")

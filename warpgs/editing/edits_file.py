@@ -137,13 +137,11 @@ def _check_effect(given: Edits, edits: Edits) -> None:
     """Raises ValueError if an object that is given a change is removed by the edits in use."""
     for option in ("recolor", "freeze", "shift"):
         for name, *_ in getattr(given, option):
+            nothing = f"--{option} {name} would change nothing, because"
             if name in split_names(edits.remove):
-                raise ValueError(f"--{option} {name} would change nothing, because --remove {edits.remove} removes it")
+                raise ValueError(f"{nothing} --remove {edits.remove} removes it: omit {name} there")
             if edits.objects is not None and name not in split_names(edits.objects):
-                raise ValueError(
-                    f"--{option} {name} would change nothing, because --objects {edits.objects} removes it: "
-                    f"add {name} to --objects"
-                )
+                raise ValueError(f"{nothing} --objects {edits.objects} removes it: add {name} to --objects")
 
 
 def check(edits: Edits) -> None:

@@ -78,7 +78,8 @@ class Objects(NamedTuple):
         counts = np.bincount(self.ids, minlength=len(self.names) + 1)[1:]
         listed = zip(range(1, len(counts) + 1), self.names, counts, strict=True)
         return ", ".join(
-            f"{k}{'' if name == str(k) else f' {name}'} ({counted(count, 'Gaussian')})" for k, name, count in listed
+            f"{k}{'' if name == str(k) else f' {name}'} ({counted(int(count), 'Gaussian')})"
+            for k, name, count in listed
         )
 
 

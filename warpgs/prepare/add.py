@@ -25,6 +25,7 @@ from warpgs.data.lens import Lens
 from warpgs.data.loaders import LOADERS, LoadOptions, missing_capture, recognize, require_finished
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
 from warpgs.data.resized import resize_mask
+from warpgs.data.results.checked import checked
 from warpgs.data.results.depth import read_depths
 from warpgs.data.results.masks import read_masks
 from warpgs.data.results.tracks import read_tracked_points
@@ -130,9 +131,7 @@ class _Job:
         missing = [name for name in names if not files[name]]
         incomplete = any(len(found) < len(self._factors()) for found in files.values())
         if incomplete and folder == self.root / "mask" and folder.is_dir():
-            raise ValueError(
-                f"{self.root} has its masks in mask/, but new ones go to resized_mask/: rename mask/ to that"
-            )
+            raise ValueError(f"{self.root} has masks in mask/, but new ones go to resized_mask/: rename mask/ to that")
         if folder == self.root / "resized_mask":
             self._complete_sizes(files)
         if not missing:
@@ -179,11 +178,9 @@ class _Job:
     def _copy_masks(self, video: list[str], missing: set[str]) -> DynamicMasks:
         """The same from the file or folder of a network."""
         images, masks = self._posed(video, WORKING_SIDE).images, []
-        given = Path(self.options.masks), video, self._sizes(video)
-        for _ in read_masks(*given):
-            pass  # all are valid before the first is written; in full size, they do not fit in memory together
+        found = checked(read_masks, Path(self.options.masks), video, self._sizes(video))
         self._keep_layout_of_estimates(missing)
-        for name, image, mask in zip(video, images, read_masks(*given), strict=True):
+        for name, image, mask in zip(video, images, found, strict=True):
             if name in missing:
                 writer.write_mask(self.root, name, ~mask, self._factors())
             masks.append(~resize_mask(~mask, image.shape[1::-1]))
@@ -266,17 +263,14 @@ class _Job:
     def _planes(self, video: list[str]) -> Iterator[Float[np.ndarray, "H W"]]:
         """Inverse depth of a camera's frames, estimated or from the file or folder of a network."""
         if self.options.depth not in DEPTHS:
-            given = Path(self.options.depth), video, self._sizes(video)
-            for _ in read_depths(*given):
-                pass  # as for masks
-            yield from read_depths(*given)
+            yield from checked(read_depths, Path(self.options.depth), video, self._sizes(video))
             return
         frames, _, planes = self._depth(video, self.options.depth)
         width = frames.lens.width
         for name, plane in zip(video, planes, strict=True):
-            lens = self._lens(name)
-            lens = lens.resized(width, round(width * lens.height / lens.width))
-            yield resampled(plane, frames.lens, lens, cv2.INTER_NEAREST)
+            own = self._lens(name)
+            own = own.resized(width, round(width * own.height / own.width))
+            yield resampled(plane, frames.lens, own, cv2.INTER_NEAREST)
 
     def add_tracks(self) -> None:
         """Writes tracks.npz from the file of a network, if the capture has no tracks."""
@@ -285,13 +279,12 @@ class _Job:
         if read_tracks(self.root, frames) is not None:
             self._say("tracks: they are there" + unread(str(path), (), FILE))
             return
-        (size, *_) = self._sizes([self.capture.train[0]])
+        (size,) = self._sizes([self.capture.train[0]])
         found = read_tracked_points(path, size)
         tracks = make_tracks(path, frames, *found, size)
         write_tracks(self.root, *found, size)
-        self._say(
-            f"tracks: {len(found.positions)} points, seen in {tracks.visible.mean():.0%} of {len(tracks.frames)} frames"
-        )
+        share, count = tracks.visible.mean(), len(tracks.frames)
+        self._say(f"tracks: {len(found.positions)} points, seen in {share:.0%} of {count} frames")
 
     def add_points(self) -> None:
         """Writes points.npy and point_colors.npy, from optical flow, if the capture has no points."""
@@ -334,9 +327,7 @@ class _Job:
         assert method is not None
         found = [video for video in videos if not method.needs_parallax or are_apart(self._centers(video))]
         if not found:
-            raise ValueError(
-                f"{self.root}: each camera stays at one place, where optical flow says nothing about depth"
-            )
+            raise ValueError(f"{self.root}: each camera stays at one place, where optical flow shows no depth")
         return found
 
     def _centers(self, names: list[str]) -> Float[np.ndarray, "F 3"]:

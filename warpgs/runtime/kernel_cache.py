@@ -99,11 +99,11 @@ def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
     key = kernel.module, device.alias, 1 if device.is_cpu else block_dim  # as in wp.launch
     if key in _loaded:
         return
-    folder = Path(wp.config.kernel_cache_dir) / kernel.module.get_module_identifier(key[2])
-    if not folder.is_dir():
-        _announce_compilation()
+    folder = _folder(kernel.module, key[2])
     if damaged := _damaged_file(folder):
         _discard(folder, f"{damaged} is not what was written")
+    elif not _has_code(folder, device):
+        _announce_compilation()
     was_cached = folder.is_dir()
     try:
         wp.load_module(kernel.module, device, block_dim=key[2])
@@ -116,6 +116,21 @@ def load(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> None:
         wp.load_module(kernel.module, device, block_dim=key[2])
     _seal(folder)
     _loaded.add(key)
+
+
+def is_compiled(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> bool:
+    """Whether the code of a kernel for a device is in the cache."""
+    return _has_code(_folder(kernel.module, 1 if device.is_cpu else block_dim), device)
+
+
+def _folder(module: wp.Module, block_dim: int) -> Path:
+    return Path(wp.config.kernel_cache_dir) / str(module.get_module_identifier(block_dim))
+
+
+def _has_code(folder: Path, device: wp.Device) -> bool:
+    """Whether the folder of a module has code for a device: it may have that of GPUs of another compute capability."""
+    names = "*.o" if device.is_cpu else f"*.sm{device.get_cuda_compile_arch()}[.af]*"
+    return any(folder.glob(names))
 
 
 @functools.cache

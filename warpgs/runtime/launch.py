@@ -22,6 +22,9 @@ from . import kernel_cache, profiling
 
 kernel_cache.init_warp()
 
+BLOCK_DIM = 256
+"""Threads per CUDA block, unless a kernel needs another number."""
+
 CHUNKS_PER_SHARD = 16
 """Chunks per core that a CPU launch is split into; cores take them in turn, so that their work is balanced."""
 
@@ -59,7 +62,7 @@ def launch(
     dim: int,
     *arguments: Any,
     per_shard: tuple[Tensor | None, ...] = (),
-    block_dim: int = 256,
+    block_dim: int = BLOCK_DIM,
     work: int | float = 1,
 ) -> None:
     """Launches ``dim`` threads of a kernel on the device of its arguments, on torch's current stream.

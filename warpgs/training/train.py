@@ -31,6 +31,7 @@ from warpgs.runs.progress import Callback
 from warpgs.runs.run import MASK_TRIAL, Run, locked_new_folder
 from warpgs.runtime import ranks
 from warpgs.runtime.devices import choose_device
+from warpgs.runtime.machine import described, kernels_note
 
 from .mask_trial import with_trusted_masks
 from .trainer import Trainer
@@ -164,7 +165,9 @@ def _describe(trainer: Trainer, log: Log) -> None:
     together = "" if ranks.num_ranks() == 1 else f", {ranks.num_ranks()} views per iteration"
     resumed = f", after iteration {trainer.iteration} of {trainer.protocol.num_iterations}" * (trainer.iteration > 0)
     views = counted(num_views, "view")
-    log(f"{name}{layout}: {views}, on {config.device}{together}, into {trainer.run}{resumed}")
+    log(f"{name}{layout}: {views}, on {described(config.device)}{together}, into {trainer.run}{resumed}")
+    if config.device == "cuda":
+        log(kernels_note("cuda"))
     for note in trainer.notes:
         log(note)
 
