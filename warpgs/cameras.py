@@ -210,6 +210,15 @@ class Camera:
             return torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1)
         return self.distortion.rays(slopes)
 
+    def directions(self) -> Float[Tensor, "P 3"]:
+        """[H W, 3] directions in the world that pixels show, row by row, of any length; NaN where nothing is seen."""
+        positions = self.pixel_centers
+        viewed = self.rays(positions)
+        if self.motion is not None:
+            turn = torch.stack([self.motion[0], torch.zeros_like(self.motion[1])])
+            viewed = at_middle_row(viewed, turn, self._readout(positions))
+        return (viewed[:, :, None] * self.viewmat[:3, :3]).sum(1)  # cuBLAS takes longer, as in ``_moved``
+
     def pixel_areas(self, positions: Float[Tensor, "P 2"]) -> Float[Tensor, " P"]:
         """[P] area at depth 1 of the pixels around positions [px from the corner], NaN where nothing is seen."""
         x, y = positions.new_tensor([0.5, 0.0]), positions.new_tensor([0.0, 0.5])

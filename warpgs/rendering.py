@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .cameras import Camera
 from .config import RenderSettings
+from .model.dome import MIN_SEEN, Dome
 from .model.splats import Splats
 from .ops.compositing import NUM_BRANCH_IMAGES, Traversal, background_bwd, composite_bwd, composite_fwd
 from .ops.projection import Geometry, View, project_bwd, project_fwd
@@ -44,6 +45,12 @@ class Layer(NamedTuple):
         """The layer with an image that has other colours where pixels show nothing (``Camera.shown``)."""
         return self._replace(image=torch.where(shown[..., None], self.image, elsewhere))
 
+    def under(self, sky: Float[Tensor, "H W 3"]) -> "Layer":
+        """The layer, which is over black, with colours of the sky behind it, which learn from pixels that show them."""
+        passes = (1.0 - self.alpha)[..., None]
+        behind = torch.where(passes.detach() >= MIN_SEEN, sky, sky.detach())
+        return self._replace(image=self.image + passes * behind)
+
     @property
     def inverse_depth(self) -> Float[Tensor, "H W"]:
         """[H, W] inverse depth; NaN where empty."""
@@ -73,6 +80,12 @@ class Rendering(NamedTuple):
     contributed: Bool[Tensor, " N"] | None
     weights: Float[Tensor, " N"] | None
     num_intersections: Int64[Tensor, "1"] | None
+
+    def under(self, sky: Float[Tensor, "H W 3"]) -> "Rendering":
+        """The same rendering, which is over black, with colours of the sky behind all its images."""
+        joint, static, dynamic = (layer and layer.under(sky) for layer in self[:3])
+        assert joint is not None
+        return self._replace(joint=joint, static=static, dynamic=dynamic)
 
 
 class _Request(NamedTuple):
@@ -126,7 +139,7 @@ class _Saved(NamedTuple):
 def render(
     splats: Splats,
     camera: Camera,
-    background: Float[Tensor, " C"] | Float[Tensor, "3 C"] | None = None,
+    background: Float[Tensor, " C"] | Float[Tensor, "3 C"] | Dome | None = None,
     settings: RenderSettings | None = None,
     screen_offsets: Float[Tensor, "N 2"] | None = None,
 ) -> Rendering:
@@ -139,8 +152,8 @@ def render(
     Args:
         splats: N Gaussians; N may be 0.
         camera: On the device of the splats.
-        background: [C] colour behind everything; with branches also [3, C], one for each of the joint, the static and
-            the dynamic image. By default that of the splats, which is black if they have none or C is not 3.
+        background: [C] colour behind everything, or the sky; with branches also [3, C], one for each of the joint, the
+            static and the dynamic image. By default that of the splats, which is black if they have none or C is not 3.
         settings: What to compute besides the joint image.
         screen_offsets: [N, 2] offsets of the Gaussians' means on screen in normalised device coordinates (halves of the
             image size), as a rule zeros. The length of their gradient is the densification statistic of 3DGS.
@@ -155,12 +168,11 @@ def render(
     settings = settings or DEFAULTS
     if background is None and splats.num_channels == 3:
         background = splats.background
+    dome, background = (background, None) if isinstance(background, Dome) else (None, background)
     _check_inputs(splats, camera, background, settings, screen_offsets)
-    splats = splats.seen_from(camera.viewmat)
-    if camera.is_panorama:
-        splats, screen_offsets = _twice(splats, camera, screen_offsets)
-        return _once(_rendered(splats, camera, screen_offsets, background, settings))
-    return _rendered(splats, camera, screen_offsets, background, settings)
+    render_all = _rendered_around if camera.is_panorama else _rendered
+    rendering = render_all(splats.seen_from(camera.viewmat), camera, screen_offsets, background, settings)
+    return rendering if dome is None else rendering.under(dome(camera))
 
 
 def _rendered(
@@ -171,6 +183,13 @@ def _rendered(
         raise ValueError("median depth has no gradient: render it with torch.no_grad()")
     outputs = differentiable(partial(_forward, _request(splats, camera, settings)), *inputs)
     return _rendering(outputs, settings)
+
+
+def _rendered_around(
+    splats: Splats, camera: Camera, screen_offsets: Tensor | None, background: Tensor | None, settings: RenderSettings
+) -> Rendering:
+    splats, screen_offsets = _twice(splats, camera, screen_offsets)
+    return _once(_rendered(splats, camera, screen_offsets, background, settings))
 
 
 def _twice(splats: Splats, camera: Camera, screen_offsets: Tensor | None) -> tuple[Splats, Float[Tensor, "M 2"]]:

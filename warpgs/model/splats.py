@@ -10,6 +10,7 @@ from torch import Tensor
 from warpgs.ops.sh import check_coefficients
 from warpgs.runtime.checks import check_same_device, check_tensor
 
+from .dome import Dome
 from .gaussians import SH_C0
 from .reflections import Reflections
 
@@ -28,8 +29,8 @@ class Splats:
         is_dynamic: [N] branch: true for dynamic, false for static Gaussians.
         objects: [N] number of the object that a Gaussian belongs to, 0 for none; None if they are not known.
         sh_degree: Highest degree of ``sh`` to use; that of ``sh`` by default.
-        background: [3] colour behind them, black if None; not used if ``colors`` have another number of channels, which
-            are composited over 0.
+        background: [3] colour behind them, or the sky, black if None; not used if ``colors`` have another number of
+            channels, which are composited over 0.
         reflections: What the last Gaussians reflect, which is added to their colours by ``sh``; None if nothing.
 
     Raises:
@@ -45,7 +46,7 @@ class Splats:
     is_dynamic: Bool[Tensor, " N"] | None = None
     objects: Int64[Tensor, " N"] | None = None
     sh_degree: int | None = None
-    background: Float[Tensor, "3"] | None = None
+    background: Float[Tensor, "3"] | Dome | None = None
     reflections: Reflections | None = None
 
     def __post_init__(self) -> None:
@@ -66,10 +67,11 @@ class Splats:
             check_tensor("is_dynamic", self.is_dynamic, ("N",), sizes, (torch.bool,))
         if self.objects is not None:
             check_tensor("objects", self.objects, ("N",), sizes, (torch.int64,))
-        if self.background is not None:
-            check_tensor("background", self.background, (3,), {})
+        behind = self.background
+        if behind is not None and not isinstance(behind, Dome):
+            check_tensor("background", behind, (3,), {})
         tensors = {name: getattr(self, name) for name in self.tensor_names()}
-        check_same_device({**tensors, "background": self.background})
+        check_same_device({**tensors, "background": behind.texels if isinstance(behind, Dome) else behind})
 
     @staticmethod
     def tensor_names() -> tuple[str, ...]:
@@ -92,7 +94,8 @@ class Splats:
 
     def to(self, device: torch.device | str) -> "Splats":
         """A copy on another device."""
-        names = (*self.tensor_names(), "background")
-        tensors = {n: t.to(device) for n in names if (t := getattr(self, n)) is not None}
+        tensors = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
         reflections = None if self.reflections is None else self.reflections.to(device)
-        return dataclasses.replace(self, **tensors, reflections=reflections)
+        behind = self.background
+        behind = behind.moved_to(device) if isinstance(behind, Dome) else None if behind is None else behind.to(device)
+        return dataclasses.replace(self, **tensors, background=behind, reflections=reflections)
