@@ -17,6 +17,7 @@ from warpgs.config.builtin import Builtin, parse_builtin
 from warpgs.synthetic import studio
 from warpgs.synthetic.degraded_depth import DegradedDepth
 from warpgs.synthetic.folder import builtin_folder
+from warpgs.synthetic.open_sky import sky_colors
 from warpgs.synthetic.studio import StudioSize, studio_capture, trace
 from warpgs.synthetic.studio_tracks import exact_tracks, with_tracks
 
@@ -57,6 +58,36 @@ def content(folder):
 )
 def test_the_content_is_the_same_everywhere(cache, depth, expected):
     assert content(studio_capture(depth, cache, SMALL, quiet=True)) == expected
+
+
+def test_the_content_under_a_sky_is_the_same_everywhere(cache):
+    assert content(studio_capture("exact", cache, SMALL, quiet=True, sky=True)) == "000dfeedf92b2bc76fa133d34f4bc5fa"
+
+
+def test_under_a_sky_rays_end_nowhere_and_points_lie_on_surfaces(cache):
+    image, depth, static = trace(0.0, 0.0, SMALL, sky=True)
+    is_sky = depth > studio.MAX_DEPTH
+    assert 0.25 < float(is_sky.float().mean()) < 0.5
+    assert bool(static[is_sky].all())
+    assert float(image[is_sky].min()) > 0.1
+    assert float(image[is_sky].std()) > 0.1
+    capture = load_capture(studio_capture("exact", cache, SMALL, quiet=True, sky=True))
+    assert len(capture.points) == SMALL.num_points
+    assert float(capture.points.norm(dim=1).max()) < 3.0
+
+
+def test_colours_of_the_sky_depend_on_directions_alone(cache):
+    directions = np.random.default_rng(0).standard_normal((20, 3))
+    assert sky_colors(directions) == pytest.approx(sky_colors(7.0 * directions))
+    assert 0.0 <= sky_colors(directions).min() < sky_colors(directions).max() <= 1.0
+
+
+def test_names_tell_whether_the_studio_is_under_a_sky():
+    assert parse_builtin("builtin:studio?depth=network&sky=yes") == Builtin("studio", "network", sky=True)
+    assert not parse_builtin("builtin:studio?sky=no").sky
+    for wrong in ("sky=blue", "sky=yes&tracks=exact"):
+        with pytest.raises(ValueError, match="there is no built-in capture"):
+            parse_builtin(f"builtin:studio?{wrong}")
 
 
 def test_one_camera_trains_and_a_second_one_beside_it_evaluates(capture):

@@ -7,7 +7,7 @@ from warpgs.errors import suggestion
 
 PREFIX = "builtin:"
 
-DEPTHS, TRACKS = ("exact", "network", "none"), ("none", "exact", "broken")
+DEPTHS, TRACKS, SKY = ("exact", "network", "none"), ("none", "exact", "broken"), ("no", "yes")
 MIN_FRAMES, MAX_FRAMES = 2, 160
 """Number of training frames of ``builtin:studio?frames=N``; as many are the default."""
 
@@ -15,13 +15,14 @@ RIG_FRAMES, MAX_CAMERAS, MAX_OFFSET = 60, 5, 1.0
 """Frames of each camera of ``builtin:rig?frames=N``, training cameras of ``builtin:rig?cameras=N``, and maximum of
 ``builtin:rig?offset=S``, by which the clocks of its cameras differ at most [s]; the first two are the defaults."""
 
-QUERIES = {"studio": ("depth", "frames", "tracks"), "rig": ("frames", "cameras", "offset")}
+QUERIES = {"studio": ("depth", "frames", "tracks", "sky"), "rig": ("frames", "cameras", "offset")}
 """What may follow the names of built-in captures."""
 
 NAMES = (
     *("builtin:room", "builtin:balls", "builtin:rig", "builtin:studio"),
     *(f"builtin:studio?depth={depth}" for depth in DEPTHS),
     *(f"builtin:studio?tracks={tracks}" for tracks in TRACKS[1:]),
+    "builtin:studio?sky=yes",
 )
 
 
@@ -40,6 +41,7 @@ class Builtin(NamedTuple):
         num_cameras: Number of training cameras of the rig.
         offset: By how much the clocks of its cameras differ at most [s].
         tracks: Tracks of the studio.
+        sky: Whether the studio is open, without tracks.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Builtin(NamedTuple):
     num_cameras: int = MAX_CAMERAS
     offset: float = 0.0
     tracks: Literal["none", "exact", "broken"] = "none"
+    sky: bool = False
 
 
 def parse_builtin(data: Path | str) -> Builtin:
@@ -61,6 +64,8 @@ def parse_builtin(data: Path | str) -> Builtin:
     options = dict(part.partition("=")[::2] for part in query.split("&")) if mark else {}
     is_known = f"{PREFIX}{name}" in NAMES and {*options} <= {*QUERIES.get(name, ())} and bool(options) == bool(mark)
     is_known &= options.get("depth", "exact") in DEPTHS and options.get("tracks", "none") in TRACKS
+    sky = options.get("sky", "no")
+    is_known &= sky in SKY and (sky == "no" or options.get("tracks", "none") == "none")
     if not is_known:
         # Without the prefix, which would make all names similar.
         close = suggestion(given, [name.removeprefix(PREFIX) for name in NAMES], f"{PREFIX}{{}}".format)
@@ -73,6 +78,7 @@ def parse_builtin(data: Path | str) -> Builtin:
         _whole(data, options.get("cameras", str(MAX_CAMERAS)), 1, MAX_CAMERAS, "cameras"),
         _seconds(data, options.get("offset", "0")),
         cast(Any, options.get("tracks", "none")),
+        sky == "yes",
     )
 
 

@@ -35,7 +35,7 @@ def builtin_folder(data: Path | str, quiet: bool = False, factor: int | None = N
     from .studio import StudioSize, studio_capture
 
     studio_size = StudioSize(num_frames=found.num_frames)
-    folder = studio_capture(found.depth, size=studio_size, quiet=quiet)
+    folder = studio_capture(found.depth, size=studio_size, quiet=quiet, sky=found.sky)
     if found.tracks == "none":
         return folder
     from .studio_tracks import with_tracks

@@ -5,9 +5,10 @@ room a mirroring ring tumbles, a glossy body is squashed and changes its lobes, 
 exact, points are noisy, depth is exact, has the errors of a network, or is missing:
 
     builtin:studio    builtin:studio?depth=network    builtin:studio?depth=none    builtin:studio?frames=12
-    builtin:studio?tracks=exact    builtin:studio?tracks=broken
+    builtin:studio?tracks=exact    builtin:studio?tracks=broken       builtin:studio?sky=yes
 
-With fewer frames, the camera and all that moves take wider steps along the same paths.
+With fewer frames, the camera and all that moves take wider steps along the same paths. With a sky, the table is on a
+terrace with a low wall and a frame of beams.
 
 The content is the same bits on every machine, so numbers can be compared: the images by the ray tracer (see its
 kernels), the rest by computing in double precision before the last rounding.
@@ -36,6 +37,7 @@ from warpgs.visualize.images import to_bytes
 from .bodies import Body, as_tensors, euler, even_samples
 from .cache import cached, content_folder
 from .degraded_depth import DegradedDepth
+from .open_sky import trace_under_sky
 from .raytrace import BLOB, CUBE, SPHERE, TORUS, TracedImage, raytrace
 from .room import BuiltinScene, stereo_frames, write_stereo_index
 
@@ -46,6 +48,9 @@ CENTER, SCALE = (0.0, 0.3, 0.9), 0.25
 
 POINT_NOISE = 0.004
 """Standard deviation of the noise on the sparse points [world units]."""
+
+MAX_DEPTH = 1e3
+"""Depth beyond which there is nothing but the sky [world units]."""
 
 BASELINE = 0.28
 """Distance of the evaluation camera, to the right of the training camera [world units]."""
@@ -67,16 +72,32 @@ class StudioSize(BuiltinScene):
     num_points: int = 10_000
 
 
-def static_bodies() -> list[Body]:
-    """The room, the table and the objects that rest on it."""
-    room = ((0.60, 0.63, 0.70), (0.74, 0.71, 0.63))
+ROOM = ((0.60, 0.63, 0.70), (0.74, 0.71, 0.63))
+"""Colours of walls and floor."""
+
+
+def terrace() -> list[Body]:
+    """What takes the place of the room under the sky."""
+    wall = ((0.70, 0.52, 0.42), (0.58, 0.40, 0.34))
+    return [
+        Body(CUBE, (0.0, 0.6, -0.65), (4.2, 4.2, 0.05), ROOM, 13.0, euler(), shine=0.0),
+        Body(CUBE, (0.0, 4.7, -0.25), (4.2, 0.10, 0.35), wall, 11.0, euler(), shine=0.0),
+        *(Body(CUBE, (x, 0.6, -0.25), (0.10, 4.2, 0.35), wall, 11.0, euler(), shine=0.0) for x in (-4.1, 4.1)),
+        *(Body(CUBE, (x, 4.5, 0.9), (0.06, 0.06, 1.5), wall, 7.0, euler(), shine=0.0) for x in (-2.4, -0.4, 1.6)),
+        Body(CUBE, (-0.4, 4.5, 1.35), (2.6, 0.05, 0.05), wall, 9.0, euler(), shine=0.0),
+    ]
+
+
+def static_bodies(sky: bool = False) -> list[Body]:
+    """The room, or a terrace under the sky, the table and the objects that rest on it."""
     wood, leg = ((0.84, 0.77, 0.56), (0.75, 0.66, 0.47)), ((0.52, 0.42, 0.30), (0.45, 0.36, 0.26))
     blue, grey = ((0.24, 0.40, 0.74), (0.88, 0.87, 0.78)), ((0.42, 0.52, 0.66), (0.80, 0.82, 0.84))
     violet, red = ((0.66, 0.46, 0.78), (0.74, 0.58, 0.82)), ((0.86, 0.36, 0.28), (0.90, 0.52, 0.36))
     pink, green = ((0.84, 0.42, 0.56), (0.92, 0.66, 0.72)), ((0.30, 0.56, 0.54), (0.42, 0.66, 0.62))
     corners = [(x, y) for x in (-1.55, 1.55) for y in (-0.9, 1.3)]
+    room = [Body(CUBE, (0.0, 0.6, 1.9), (4.2, 4.2, 2.5), ROOM, 13.0, euler(), shine=0.0)]
     return [
-        Body(CUBE, (0.0, 0.6, 1.9), (4.2, 4.2, 2.5), room, 13.0, euler(), shine=0.0),
+        *(terrace() if sky else room),
         Body(CUBE, (0.0, 0.2, 0.54), (1.7, 1.25, 0.06), wood, 6.0, euler(), shine=0.05),
         Body(CUBE, (-0.55, 0.95, 0.94), (0.20, 0.20, 0.34), blue, 7.0, euler(z=0.4)),
         Body(CUBE, (0.35, 0.70, 0.76), (0.19, 0.15, 0.16), grey, 6.0, euler(z=-0.5)),
@@ -128,30 +149,32 @@ def camera_at(time: float, shift: float, size: StudioSize) -> Camera:
     return lens_of(size).camera(rotation, position, time)
 
 
-def trace(time: float, shift: float, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:
-    """Image [H, W, 3], depth [H, W] in world units and static mask [H, W] of a frame.
+def trace(time: float, shift: float, size: StudioSize, sky: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+    """Image [H, W, 3], depth [H, W] in world units, 1e6 in the sky, and static mask [H, W] of a frame.
 
     The time is in [0, 1], and the camera ``shift`` [world units] to the right of the training camera.
     """
-    return trace_from(camera_at(time, shift, size), size)
+    return trace_from(camera_at(time, shift, size), size, sky)
 
 
-def trace_from(camera: Camera, size: StudioSize) -> tuple[Tensor, Tensor, Tensor]:
+def trace_from(camera: Camera, size: StudioSize, sky: bool = False) -> tuple[Tensor, Tensor, Tensor]:
     """The same through a camera in world units, at its time, which may be later than 1."""
-    static = static_bodies()
-    traced = trace_bodies([*static, *moving_bodies(camera.time)], camera, size.num_samples)
+    static = static_bodies(sky)
+    traced = trace_bodies([*static, *moving_bodies(camera.time)], camera, size.num_samples, sky)
     return traced.image, traced.depth, traced.bodies < len(static)
 
 
-def trace_bodies(bodies: Sequence[Body], camera: Camera, num_samples: int) -> TracedImage:
-    """What a camera in world units sees of bodies under the lamp of the studio."""
+def trace_bodies(bodies: Sequence[Body], camera: Camera, num_samples: int, sky: bool = False) -> TracedImage:
+    """What a camera in world units sees of bodies under the lamp of the studio, and behind them of the sky."""
     cpu = torch.device("cpu")  # a GPU rounds otherwise
     lamp = torch.tensor([[1.3, -1.0, 4.1], [0.45, 0.0, 0.0], [0.0, 0.45, 0.0]], dtype=torch.float32)
     samples = even_samples(num_samples, cpu)
+    if sky:
+        return trace_under_sky(bodies, lamp, samples, camera)
     return raytrace(as_tensors(bodies, cpu), lamp, samples, camera.viewmat, camera.K, camera.size)
 
 
-def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:
+def write_studio(folder: Path, size: StudioSize, quiet: bool = False, sky: bool = False) -> None:
     """Writes the capture, with exact depth, to an empty folder.
 
     Raises:
@@ -161,7 +184,7 @@ def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:
     frames, points = stereo_frames(size.num_frames, BASELINE), []
     for name, k, shift in progress(frames, "creating builtin:studio, once for all runs", quiet):
         time = k / (size.num_frames - 1)
-        image, depth, static = trace(time, shift, size)
+        image, depth, static = trace(time, shift, size, sky)
         rotation, position = _pose(time, shift)
         writer.write_image(folder, name, to_bytes(image))
         writer.write_mask(folder, name, static.numpy())
@@ -170,7 +193,8 @@ def write_studio(folder: Path, size: StudioSize, quiet: bool = False) -> None:
             inverse = 1.0 / depth.numpy().astype(np.float64)
             writer.write_depth(folder, name, sixteen_bits(inverse, k / size.num_frames))
             count = -(-size.num_points // size.num_frames)
-            points.append(surface_points(inverse, static.numpy(), lens_of(size), (rotation, position), count, k))
+            surface = static.numpy() & (depth.numpy() < MAX_DEPTH)
+            points.append(surface_points(inverse, surface, lens_of(size), (rotation, position), count, k))
     units = SceneUnits(np.array(CENTER), SCALE)
     writer.write_scene(folder, units, np.concatenate(points)[: size.num_points], near=0.05, far=3.0)
     write_stereo_index(folder, frames)
@@ -216,15 +240,22 @@ def surface_points(
 
 
 def studio_capture(
-    depth: Depth = "exact", cache_dir: Path | None = None, size: StudioSize | None = None, quiet: bool = False
+    depth: Depth = "exact",
+    cache_dir: Path | None = None,
+    size: StudioSize | None = None,
+    quiet: bool = False,
+    sky: bool = False,
 ) -> Path:
-    """The folder of the capture with exact depth, with the errors of a network, or without; see ``builtin_capture``."""
-    size = size or StudioSize()
-    root = content_folder(cache_dir, ["studio", VERSION, asdict(size)])
-    exact = cached(root / "studio", lambda partial: write_studio(partial, size, quiet), quiet)
+    """The folder of the capture with exact depth, with the errors of a network, or without; see ``builtin_capture``.
+
+    With ``sky``, the room is open.
+    """
+    size, name = size or StudioSize(), "studio-sky" if sky else "studio"
+    root = content_folder(cache_dir, [name, VERSION, asdict(size)])
+    exact = cached(root / name, lambda partial: write_studio(partial, size, quiet, sky), quiet)
     if depth == "exact":
         return exact
-    copy = root / f"studio-depth-{depth}"
+    copy = root / f"{name}-depth-{depth}"
     return cached(copy, lambda partial: _copy(exact, partial, depth == "network"), quiet)
 
 
