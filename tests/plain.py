@@ -60,5 +60,5 @@ phase = partial(
 
 def plan(config: TrainConfig) -> Plan:
     """The plan of a config, on the CPU, over black unless it names a colour."""
-    background = "black" if config.background in ("capture", "mean") else config.background
+    background = "black" if config.background in ("auto", "capture", "mean") else config.background
     return Plan.of(config, "cpu", background, config.loss.branches_in_stage2 != "no")

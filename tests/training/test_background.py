@@ -252,5 +252,5 @@ def test_a_background_may_be_given_in_rgb(capture, words, expected):
 
 @pytest.mark.parametrize("background", ["grey", [0.1, 0.2, 0.3], (0.5, 0.5), (0.5, 0.5, 1.5), 0.5])
 def test_a_background_that_is_no_colour_is_refused_before_training(background):
-    with pytest.raises(ValueError, match="background must be capture, mean, black, white, or three numbers"):
+    with pytest.raises(ValueError, match="background must be auto, sky, mean, capture, black, white, or three numbers"):
         validate(plain.config(background=background))

@@ -233,7 +233,7 @@ def test_gaussians_settle_at_a_tenth_of_their_rates():
 def test_the_other_rates_of_gaussians_depend_neither_on_progress_nor_on_the_unit():
     now, later = rates_at(0.0, START), rates_at(0.9, END, unit=5.0)
     changed = {name for name in GROUPS if now[name] != later[name]}
-    assert changed == {"static.means", "dynamic.means", *NETWORKS, "light"}
+    assert changed == {"static.means", "dynamic.means", *NETWORKS, "light", "dome"}
 
 
 def test_each_network_has_its_own_progress():

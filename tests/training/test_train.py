@@ -158,7 +158,7 @@ def test_a_run_keeps_its_config_as_it_was_asked_for(finished):
     start = json.loads((finished[1] / "start.json").read_text())
     asked = parse_config(start["asked"], "start.json")
     assert (asked.iterations, read_config(finished[1]).iterations) == (40, None)
-    assert (asked.schedule, asked.background) == (PRESETS["quick"].schedule, "mean")
+    assert (asked.schedule, asked.background) == (PRESETS["quick"].schedule, "auto")
 
 
 def test_a_run_keeps_in_its_metrics_what_was_noted_before_the_first_step(finished):

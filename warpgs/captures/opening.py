@@ -76,6 +76,5 @@ def open_capture(config: TrainConfig, quiet: bool = False) -> Capture:
     )
     capture = load_with(root, config.dataset, options)
     capture.is_builtin = config.data is None or is_builtin(config.data)
-    if config.background == "capture" or config.background == "mean":
-        return capture
-    return capture.over(config.background)
+    asked = config.background
+    return capture if asked == "auto" or asked == "capture" or asked == "mean" else capture.over(asked)

@@ -20,7 +20,7 @@ NetName = Literal["vgg", "alex", "squeeze"]
 Component = Literal["dap", "vdp", "app", "stage2"]
 """Components of the paper, by their names in its Table 4."""
 
-BackgroundName = Literal["capture", "mean", "black", "white"]
+BackgroundName = Literal["auto", "sky", "mean", "capture", "black", "white"]
 """Backgrounds that have a name."""
 
 
@@ -70,9 +70,10 @@ class TrainConfig:
     """What moves: what the masks mark, nothing (static), or everything (dynamic). With auto it is the masks, unless
     they are estimates of `prepare` and two short trainings, before runs that are longer, are better on held-out frames
     with everything dynamic."""
-    background: BackgroundName | tuple[float, float, float] = "mean"
-    """Colour behind all Gaussians: that of the capture, which is white if D-NeRF's images have alpha, else black; the
-    same, but the mean colour of the training frames instead of black (mean); or red, green and blue in [0, 1]."""
+    background: BackgroundName | tuple[float, float, float] = "auto"
+    """Behind all Gaussians: that of the capture, which is white if D-NeRF's images have alpha, else black; the same,
+    but the mean colour of the training frames instead of black (mean); learned colours by direction (sky); a sky where
+    depth shows one beyond all points, else as mean (auto); or red, green and blue in [0, 1]."""
     frozen: Literal["nothing", "geometry", "appearance", "all"] = "nothing"
     """What stage II no longer optimizes of static Gaussians: positions, scales and rotations (geometry), w⁰, to which
     residuals are added (appearance), or both (all; paper)."""

@@ -12,8 +12,8 @@ Device = Literal["cuda", "cpu"]
 Color = tuple[float, float, float]
 """Red, green and blue in [0, 1]."""
 
-Background = Literal["black", "white"] | Color
-"""Colour behind all Gaussians."""
+Background = Literal["black", "white", "sky"] | Color
+"""What is behind all Gaussians: a colour, or learned colours by direction."""
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,8 @@ COLORS: dict[Literal["black", "white"], Color] = {"black": (0.0, 0.0, 0.0), "whi
 
 
 def background_color(background: Background) -> Color:
-    """RGB in [0, 1]."""
-    return background if isinstance(background, tuple) else COLORS[background]
+    """RGB in [0, 1]; black under the sky."""
+    return background if isinstance(background, tuple) else COLORS["white" if background == "white" else "black"]
 
 
 def path_radius(cameras: Sequence[Camera]) -> float:

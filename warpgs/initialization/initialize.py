@@ -20,6 +20,7 @@ from warpgs.views.views import Views
 from .dynamic_points import MAX_SCALE, DynamicPoints, gaussians_in_box, is_depth_known, unproject_pixels
 from .motion_fit import MAX_POINTS, Observed, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
+from .sky import find_sky, make_dome, without_points
 from .track_paths import dynamic_paths
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks
@@ -35,8 +36,12 @@ place. A Gaussian as small as the error between the scans would be culled and pr
 def initial_scene(config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator) -> SplitScene:
     """Static Gaussians at the sparse points (at random ones in the scene's box if there are none), no dynamic ones yet.
 
-    If everything is assumed to be dynamic, there are no static Gaussians either.
+    If everything is assumed to be dynamic, there are no static Gaussians either. There are none in the sky.
     """
+    dome = None
+    if config.background == "sky":
+        sky = find_sky(capture)
+        dome, capture = make_dome(capture, sky), without_points(capture, sky)
     center, half_size = scene_box(capture.points)
     degree = config.model.sh_degree
     static = Gaussians.empty(0, degree)
@@ -44,7 +49,7 @@ def initial_scene(config: TrainConfig, capture: Capture, views: Views, generator
         static = _gaussians_at_points(config, capture, views, generator)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        scene = SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size)
+        scene = SplitScene(static, Gaussians.empty(0, degree), config.model, center, half_size, dome)
     for module in scene.deformation.modules():
         if isinstance(module, MlpDeformation):
             module.units[:3] = config.offset_unit(capture.view_size)

@@ -10,6 +10,8 @@ from warpgs.data.capture import COLORS, Capture, background_color
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.runtime.devices import choose_device
 
+from .sky import find_sky
+
 MANY_FRAMES = 80
 """Number of training frames from which on corrections of poses have their whole rate. Cameras of fewer are each seen
 more often: at the rate of 80 frames those of 14 are led away from where their held-out neighbours are."""
@@ -25,7 +27,8 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
         ValueError: If a number of the config is out of its range, or there is no such device.
     """
     config, notes = scaled(config), []
-    background, loss = _background(config, capture), config.loss
+    (background, found), loss = _background(config, capture), config.loss
+    notes += found
     asked, num = config.model.time_bands, len(capture.moments)
     bands = determined_bands(config.model, num)
     if bands < asked:
@@ -43,16 +46,25 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
     return Plan.of(config, choose_device(config.device), background, branches), notes
 
 
-def _background(config: TrainConfig, capture: Capture) -> Background:
-    """The background of a config: what it asks for, or that of the capture, with the mean colour instead of black.
+def _background(config: TrainConfig, capture: Capture) -> tuple[Background, list[str]]:
+    """The background of a config, and a sentence if it was found: what it asks for, or that of the capture.
 
-    Black and white get their names: captures over white know where frames are empty.
+    Instead of black, it is a sky where the capture shows one, or the mean colour. Black and white get their names:
+    captures over white know where frames are empty.
     """
-    if config.background == "capture" or (config.background == "mean" and capture.background != "black"):
-        return capture.background
-    color = mean_color(capture) if config.background == "mean" else background_color(config.background)
+    asked = config.background
+    if asked == "capture" or (asked in ("auto", "mean") and capture.background != "black"):
+        return capture.background, []
+    seen = capture.assuming(config.assumption)  # where nothing is static, dynamic Gaussians have to paint the sky
+    if asked == "auto" and (sky := find_sky(seen)) is not None:
+        return "sky", [
+            f"the sky, {sky.share:.0%} of the pixels, is behind all Gaussians: its depth is beyond all points"
+        ]
+    if asked == "sky":
+        return "sky", []
+    color = mean_color(capture) if asked == "auto" or asked == "mean" else background_color(asked)
     names: dict[Background, Background] = {value: name for name, value in COLORS.items()}
-    return names.get(color, color)
+    return names.get(color, color), []
 
 
 def mean_color(capture: Capture) -> Color:

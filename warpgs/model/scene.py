@@ -13,6 +13,7 @@ from warpgs.config import ModelConfig
 from warpgs.ops.activation import Changes, activate, join_sh
 from warpgs.runtime.streams import concurrently
 
+from .dome import Dome
 from .fields import make_deformation
 from .gaussians import Gaussians
 from .reflections import Light, reflections
@@ -66,6 +67,7 @@ class SplitScene(nn.Module):
         static, dynamic: The Gaussians of the two branches.
         config: Which networks, and their sizes.
         center, half_size: [3] box of the scene, by which the networks normalize positions.
+        dome: The sky; None without.
 
     Attributes:
         static: Gaussians of constant geometry; w⁰ of Eq. 8 is their own appearance.
@@ -73,6 +75,7 @@ class SplitScene(nn.Module):
         deformation: F_θ of Eq. 10.
         appearance: MLP_app of Eq. 8.
         light: What the dynamic Gaussians reflect; None if they reflect nothing.
+        dome: The sky behind all Gaussians; None if a colour is behind them.
 
     Raises:
         ValueError: If there is no deformation model of the configured name.
@@ -85,9 +88,10 @@ class SplitScene(nn.Module):
         config: ModelConfig,
         center: Float[Tensor, "3"],
         half_size: Float[Tensor, "3"],
+        dome: Dome | None = None,
     ) -> None:
         super().__init__()
-        self.static = static
+        self.static, self.dome = static, dome
         self.deformation = make_deformation(config, center, half_size)
         self.appearance = AppearanceField(config, center, half_size)
         self.sh_degree, self.light = config.sh_degree, Light(center) if config.reflections else None
@@ -100,12 +104,11 @@ class SplitScene(nn.Module):
         self.dynamic = dynamic
 
     @staticmethod
-    def empty(num_static: int, num_dynamic: int, config: ModelConfig) -> "SplitScene":
+    def empty(num_static: int, num_dynamic: int, config: ModelConfig, has_dome: bool = False) -> "SplitScene":
         """A scene with arbitrary values, to load a checkpoint into."""
         static, dynamic = (Gaussians.empty(num, config.sh_degree) for num in (num_static, num_dynamic))
-        return SplitScene(
-            static, dynamic, config, torch.zeros(3, dtype=torch.float32), torch.ones(3, dtype=torch.float32)
-        )
+        center, half_size = torch.zeros(3, dtype=torch.float32), torch.ones(3, dtype=torch.float32)
+        return SplitScene(static, dynamic, config, center, half_size, Dome() if has_dome else None)
 
     def select(self, static: Bool[Tensor, " S"], dynamic: Bool[Tensor, " D"]) -> "SplitScene":
         """A scene of copies of the Gaussians to keep, with the same networks."""

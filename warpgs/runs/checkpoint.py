@@ -299,8 +299,8 @@ def load_poses(checkpoint: Checkpoint, unit: float) -> PoseCorrections:
     return poses
 
 
-def load_scene(checkpoint: Checkpoint, config: ModelConfig) -> SplitScene:
-    """The scene of a checkpoint, on the CPU.
+def load_scene(checkpoint: Checkpoint, config: ModelConfig, has_dome: bool = False) -> SplitScene:
+    """The scene of a checkpoint, on the CPU; with ``has_dome`` under a sky.
 
     Raises:
         DamagedCheckpointError: If its values are not finite, or its metadata does not fit the config.
@@ -316,7 +316,7 @@ def load_scene(checkpoint: Checkpoint, config: ModelConfig) -> SplitScene:
     try:
         # Rows of three: the size of the file bounds their number, whatever shape it claims.
         static, dynamic = state["static.means"].view(-1, 3), state["dynamic.means"].view(-1, 3)
-        sizes = len(static), len(dynamic), config
+        sizes = len(static), len(dynamic), config, has_dome
         with torch.device("meta"):  # a config that claims too much takes no memory there
             SplitScene.empty(*sizes).load_state_dict(state, assign=True)
         scene = SplitScene.empty(*sizes)

@@ -170,7 +170,7 @@ class Run:
             raise ValueError(f"{self.folder} has no checkpoint yet")
         try:
             loaded = checkpoint.load(saved[-1])
-            scene = checkpoint.load_scene(loaded, self.config.model)
+            scene = checkpoint.load_scene(loaded, self.config.model, self.config.background == "sky")
         except checkpoint.DamagedCheckpointError as error:
             if len(saved) == 1:
                 raise

@@ -54,7 +54,8 @@ class TrainedScene:
     Attributes:
         rows (Tensor | None): [N] the rows that its Gaussians have in the scene they were selected from; None in that.
         varies: Whether it has other Gaussians at other times, so that ``scene`` are not all.
-        background (Tensor | None): [3] colour behind all Gaussians, on the scene's device; None is black.
+        background (Tensor | Dome | None): Behind all Gaussians, on the scene's device: a [3] colour, or the sky; None
+            is black.
     """
 
     varies = False
@@ -65,7 +66,7 @@ class TrainedScene:
         self._graphs: GraphCache[tuple[int, int]] = GraphCache(MAX_GRAPHS, repeatable=True)
         self._inputs: _Inputs | None = None
         color = background_color(config.background)
-        self.background = torch.tensor(color, dtype=torch.float32, device=self.device) if any(color) else None
+        self.background = torch.tensor(color, dtype=torch.float32, device=self.device) if any(color) else scene.dome
 
     def __repr__(self) -> str:
         static, dynamic = len(self.scene.static), len(self.scene.dynamic)

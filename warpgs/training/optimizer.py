@@ -34,6 +34,9 @@ FIXED_RATES = {"quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 0.05, "sh_r
 REFLECTANCES = 2.5e-3
 """Learning rate of the dynamic Gaussians' reflectances, that of colours (3DGS)."""
 
+DOME, DOME_DECAY = 2.5e-3, 0.01
+"""Learning rate of the colours of the sky, and the final one relative to it."""
+
 MEANS_DECAY = 0.01
 """Final learning rate of positions, relative to the initial one (3DGS)."""
 
@@ -46,9 +49,9 @@ POSES_DECAY = 0.01
 BRANCHES = ("static", "dynamic")
 NETWORKS = ("deformation", "appearance")
 REFLECTIONS = ("dynamic.reflectances", "light")
-GROUPS = (*(f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS), *NETWORKS, "poses", *REFLECTIONS)
-"""Names of the parameter groups: each Gaussian parameter of each branch, each network, the camera poses, and what
-dynamic Gaussians reflect."""
+GROUPS = (*(f"{branch}.{name}" for branch in BRANCHES for name in PARAMETERS), *NETWORKS, "poses", *REFLECTIONS, "dome")
+"""Names of the parameter groups: each Gaussian parameter of each branch, each network, the camera poses, what dynamic
+Gaussians reflect, and the sky."""
 
 
 def trained_parameters(scene: SplitScene, poses: PoseCorrections | None) -> dict[str, nn.Parameter]:
@@ -116,6 +119,7 @@ def learning_rates(config: OptimConfig, unit: float, at: RatePlan) -> dict[str, 
         rates[name] = at.warmup_factors[name] * rate
     rates["dynamic.reflectances"] = settled * REFLECTANCES
     rates["light"] = exponential(config.networks, config.networks_end, at.network_progress["deformation"])
+    rates["dome"] = exponential(DOME, DOME_DECAY * DOME, at.progress)
     rates["poses"] = exponential(config.poses, POSES_DECAY * config.poses, at.progress)
     return {name: math.sqrt(ranks.num_ranks()) * rate for name, rate in rates.items()}
 

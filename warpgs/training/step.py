@@ -14,6 +14,7 @@ from warpgs.config import RenderSettings, TrainConfig
 from warpgs.data.capture import background_color
 from warpgs.evaluation.image_quality import MIN_SQUARED_ERROR
 from warpgs.initialization.alignment import DepthTrust
+from warpgs.model.dome import Dome
 from warpgs.model.scene import PointsInTime, SplitScene
 from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
@@ -177,6 +178,7 @@ class Step:
         screen_offsets = self.density.screen_offsets if phase.densifies else None
         behind = backgrounds if phase.with_branches else backgrounds[0]
         rendering = render(splats, view.camera, behind, self._settings(phase), screen_offsets)
+        rendering = rendering if self.scene.dome is None else self._under_sky(self.scene.dome, rendering, view)
         rendering = only_shown(rendering, view, backgrounds[2])
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
@@ -193,7 +195,7 @@ class Step:
         return ()
 
     def _backgrounds(self) -> Float[Tensor, "3 3"]:
-        """Colours behind the joint, the static and the dynamic image.
+        """Colours behind the joint, the static and the dynamic image; the first two are black under a sky.
 
         The last one is another one in every iteration, so that no opaque Gaussian is as good as a transparent one where
         Eq. 12 wants nothing to be seen; such Gaussians would hide the static scene. Images over white have their own
@@ -201,6 +203,14 @@ class Step:
         """
         behind = self._background if self.views.background == "white" else self._inputs.color
         return torch.stack([self._background, self._background, behind])
+
+    def _under_sky(self, dome: Dome, rendering: Rendering, view: View) -> Rendering:
+        """The sky behind the joint and the static image; it learns from static pixels that may show it."""
+        (scale, offset), _ = self._depth_of_view()
+        hidden = dome.hidden(scale * view.inverse_depth + offset) | ~view.static_mask
+        colors = dome(view.camera)
+        colors = torch.where(hidden[..., None], colors.detach(), colors)
+        return rendering._replace(dynamic=None).under(colors)._replace(dynamic=rendering.dynamic)
 
     def _active(self, phase: Phase) -> list[str]:
         """The terms of the loss that are computed in a phase."""

@@ -297,7 +297,7 @@ class Trainer:
         self.unit = checkpoint.unit_of(loaded, [self.capture.cameras[name] for name in self.capture.train])
         if self.views.poses is not None:
             self.views.poses = checkpoint.load_poses(loaded, self.unit).to(self.device)
-        self._set_scene(checkpoint.load_scene(loaded, self.config.model))
+        self._set_scene(checkpoint.load_scene(loaded, self.config.model, self.config.background == "sky"))
         for name, parameter in self.step.parameters().items():
             if f"adam.step.{name}" in loaded.tensors:
                 shapes = {"step": torch.Size(), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}

@@ -11,6 +11,7 @@ from warpgs.cameras import Camera
 from warpgs.command_line.progress import progress
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.model.dome import Dome
 from warpgs.rendering import Layer
 from warpgs.runs.trained import TrainedScene
 from warpgs.visualize.depth import depth_bounds, depth_image
@@ -74,10 +75,12 @@ def _images(
         return [averaged(rendering.joint.alpha[..., None].expand(-1, -1, 3), options.supersample)]
     by_name = {"joint": rendering.joint, "static": rendering.static, "dynamic": rendering.dynamic}
     layers = [by_name[name] for name in (COLORED if options.layers == "all" else (options.layers,))]
-    return [_pixels(layer, options, scene.background) for layer in layers if layer is not None]
+    behind = scene.background
+    colors = behind(larger.to(scene.device)) if isinstance(behind, Dome) else behind
+    return [_pixels(layer, options, colors) for layer in layers if layer is not None]
 
 
-def _pixels(layer: Layer, options: Render, background: Float[Tensor, "3"] | None) -> Float[Tensor, "H W C"]:
+def _pixels(layer: Layer, options: Render, background: Tensor | None) -> Float[Tensor, "H W C"]:
     """RGB over the scene's background; with transparency RGBA, whose colour is not multiplied by its alpha."""
     if not options.transparent:
         return averaged(layer.image.clamp(0, 1), options.supersample)
