@@ -25,6 +25,9 @@ COUNTS = {"frames": MAX_FRAMES, "keys": MAX_KEYS}
 REFLECTIONS_NOTE = "no format holds reflections: dynamic Gaussians have the colours of their spherical harmonics alone"
 """A line about scenes of ``model.reflections``."""
 
+SKY_NOTE = "--format {} holds no sky, which was behind the Gaussians in training: only {} do"
+"""A line about scenes under a sky."""
+
 POSITIVE = ("seconds", "max_megabytes", "precision", "voxel")
 """Options that are positive numbers."""
 
@@ -43,7 +46,9 @@ def export_run(options: Export) -> str:
     writer = WRITERS[options.format]
     job = Job(run, options, writer.has_objects)
     _check_sequence(job.clouds.scene, options)
-    if not writer.has_background and not isinstance(run, SceneFile):
+    if job.clouds.scene.scene.dome is not None:
+        job.notes += [] if writer.has_sky else [SKY_NOTE.format(options.format, _with_sky())]
+    elif not writer.has_background and not isinstance(run, SceneFile):
         job.notes.append(_background_note(run))
     if job.clouds.scene.scene.light is not None:
         job.notes.append(REFLECTIONS_NOTE)
@@ -64,6 +69,10 @@ def _background_note(run: Run) -> str:
     """A line about the colour behind everything, for files that do not have it."""
     color = "#" + "".join(f"{round(255 * value):02x}" for value in background_color(run.config.background))
     return f"behind the Gaussians was {color} in training: give the viewer this background, as gaps show it"
+
+
+def _with_sky() -> str:
+    return " and ".join(name for name, writer in WRITERS.items() if writer.has_sky)
 
 
 def _check_format(options: Export) -> None:

@@ -115,6 +115,7 @@ class Writer(NamedTuple):
         options: Names of those options of ``Export`` that apply to this format but not to every other.
         suffix: End of its file names, with the dot; ``--out`` may be such a file. Empty if it has to be a folder.
         has_background: Whether its files have the colour behind the Gaussians; the summary names it otherwise.
+        has_sky: Whether its files have the sky; the summary says that they lack it otherwise.
         has_objects: Whether its files have the objects that Gaussians belong to.
         y_up: Whether readers assume that y points up instead of down; None if files keep the scene's coordinates.
     """
@@ -123,5 +124,6 @@ class Writer(NamedTuple):
     options: tuple[str, ...]
     suffix: str = ""
     has_background: bool = False
+    has_sky: bool = False
     has_objects: bool = False
     y_up: bool | None = False

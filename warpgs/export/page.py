@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Int32, UInt8
 
 from warpgs.command_line.progress import progress
 from warpgs.editing.contribution import contribution, sample_cameras
-from warpgs.files import write_bytes, write_png
+from warpgs.files import encode_png, write_bytes, write_png
 from warpgs.formats.packing import to_planes
 from warpgs.video.camera_paths import evenly_spaced
 from warpgs.video.filmed import DRAG_LIMIT, REACH, Filmed
@@ -53,7 +53,14 @@ REPLACED = "\0\r<"
 """Characters that a page cannot hold as they are: browsers replace NUL, CR becomes LF, and < could end the element."""
 
 
-def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True, url: str | None = None) -> int:
+def write_page(
+    path: Path,
+    baked: Baked,
+    start: StartView,
+    quiet: bool = True,
+    url: str | None = None,
+    sky: UInt8[np.ndarray, "rows columns 3"] | None = None,
+) -> int:
     """Writes the page; returns its size [bytes].
 
     Args:
@@ -62,6 +69,7 @@ def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True, u
         start: How the page starts.
         quiet: Whether to show no progress.
         url: Address of the folder in which it will be; None if that is not known.
+        sky: [rows, columns, 3] colours by direction behind everything (``Dome.image``); None without.
 
     Raises:
         ValueError: If the scene has more key times or Gaussians than browsers support.
@@ -69,23 +77,31 @@ def write_page(path: Path, baked: Baked, start: StartView, quiet: bool = True, u
     """
     branches = {"static": baked.static, "dynamic": baked.dynamic}
     check_size({name: len(branch) for name, branch in branches.items()}, baked.keys)
-    metadata = {
-        "format": "warpgs page",
-        "version": VERSION,
-        "keys": baked.keys,
-        "start": {field.name: getattr(start, field.name) for field in fields(start) if field.name != "filmed"},
-        "filmed": _filmed(start.filmed),
-        "branches": {name: _metadata(branch) for name, branch in branches.items()},
-    }
-    blocks = [_block("application/json", "scene", json.dumps(metadata, allow_nan=False).replace("<", "\\u003c"))]
+    blocks = [_block("application/json", "scene", _content(baked, start))]
     parts = [(name, part) for name in branches for part in PARTS]
     for name, part in progress(parts, "compressing", quiet):
         levels: Levels = getattr(branches[name], part)
         blocks.append(_packed(f"{name}-{part}", _differences(levels.levels) if part == DIFFERENCES else levels.levels))
         blocks.append(_packed(f"{name}-{part}-basis", levels.basis[:, :, None]))
     blocks += [_packed(f"{name}-octaves", branch.octaves[None, :, None]) for name, branch in branches.items()]
+    blocks += [] if sky is None else [_block("image/png", "sky", to_text(encode_png(sky)))]
     shared = card(start, len(baked.static) + len(baked.dynamic), path, url)
     return write_bytes(path, [_player(start.title, shared, "\n".join(blocks)).encode()])
+
+
+def _content(baked: Baked, start: StartView) -> str:
+    """The shapes and steps of the data, and how the page starts, as JSON."""
+    metadata = {
+        "format": "warpgs page",
+        "version": VERSION,
+        "keys": baked.keys,
+        "start": {field.name: getattr(start, field.name) for field in fields(start) if field.name != "filmed"},
+        "filmed": _filmed(start.filmed),
+        "branches": {
+            name: _metadata(branch) for name, branch in (("static", baked.static), ("dynamic", baked.dynamic))
+        },
+    }
+    return json.dumps(metadata, allow_nan=False).replace("<", "\\u003c")
 
 
 MAX_TITLE = 200
@@ -194,7 +210,8 @@ def _write(job: Job) -> str:
     weights = contribution(scene, sample_cameras(scene, job.capture), options.quiet).largest.numpy()
     times = progress(evenly_spaced(keys), "baking", options.quiet)
     baked = bake(job.clouds.at, times, options.precision or 1.0, weights)
-    size = write_page(path, baked, start, options.quiet, options.url)
+    dome = scene.scene.dome
+    size = write_page(path, baked, start, options.quiet, options.url, None if dome is None else dome.image())
     write_png(picture_path(path), picture(scene, start))
     count = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
     shared = f"{picture_path(path).name}: its picture where its address is shared"
@@ -202,5 +219,5 @@ def _write(job: Job) -> str:
 
 
 OPTIONS = ("keys", "seconds", "max_megabytes", "precision", "title", "url")
-PAGE = Writer(_write, OPTIONS, ".html", has_background=True, y_up=None)
+PAGE = Writer(_write, OPTIONS, ".html", has_background=True, has_sky=True, y_up=None)
 """The format "html"."""

@@ -3,7 +3,7 @@
 https://openusd.org/release/user_guides/schemas/usdVol/ParticleField3DGaussianSplat.html: positions, orientations,
 linear scales, opacities in [0, 1], and per Gaussian the coefficients of all degrees and its object (primvar
 ``objectId``). What does not change over time is stored once; programs interpolate linearly between time samples. Axes
-are x right, y up, z towards the viewer.
+are x right, y up, z towards the viewer. A sky is a dome light, with a PNG file beside the scene.
 """
 
 from pathlib import Path
@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Int64
+from scipy.spatial.transform import Rotation
 
-from warpgs.files import atomic_path
+from warpgs.files import atomic_path, write_png
 from warpgs.formats.cloud import Cloud, sigmoid
 from warpgs.formats.packages import required
 from warpgs.ops.sh import degree_of
@@ -45,9 +46,31 @@ def write_usd(job: Job) -> str:
     for k, cloud in enumerate(clouds_over_time(job, keys)):
         for field, is_dynamic in zip(fields, (False, True), strict=True):
             field.add(cloud.select(cloud.is_dynamic == is_dynamic), float(k))
+    sky = _add_sky(stage, job, path)
     save_stage(stage, path)
     count = f"{fields[0].count:,} static and {fields[1].count:,} dynamic Gaussians at {keys} key times"
-    return f"{path}: {count}, {path.stat().st_size / 1e6:.1f} MB\n{job.up_note}"
+    return f"{path}: {count}, {path.stat().st_size / 1e6:.1f} MB{sky}\n{job.up_note}"
+
+
+SCENE_FROM_DOME = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""From the axes of a dome light, whose texture begins at longitude π of OpenEXR's latitude-longitude maps, y up, to
+those of the sky, whose columns go around z the other way."""
+
+
+def _add_sky(stage: Any, job: Job, path: Path) -> str:
+    """Adds the sky of a scene that has one, and writes its image; returns the end of a line about it."""
+    dome = job.clouds.scene.scene.dome
+    if dome is None:
+        return ""
+    UsdLux, Gf = required(path, "pxr.UsdLux", "usd-core"), required(path, "pxr.Gf", "usd-core")
+    image = path.with_name(f"{path.stem}-sky.png")
+    write_png(image, np.ascontiguousarray(dome.image()[:, ::-1]))
+    light = UsdLux.DomeLight.Define(stage, "/Scene/sky")
+    light.CreateTextureFileAttr(f"./{image.name}")
+    light.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
+    x, y, z, w = Rotation.from_matrix(job.rotation(True) @ SCENE_FROM_DOME).as_quat().tolist()
+    light.AddOrientOp().Set(Gf.Quatf(w, x, y, z))
+    return f", with its sky in {image.name}"
 
 
 def save_stage(stage: Any, path: Path) -> None:
@@ -134,4 +157,4 @@ def _to_usd(name: str, values: np.ndarray) -> Any:
     return types.get(name, Vt.Vec3fArray).FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
-USD = Writer(write_usd, OPTIONS, ".usdc", has_objects=True, y_up=True)
+USD = Writer(write_usd, OPTIONS, ".usdc", has_sky=True, has_objects=True, y_up=True)

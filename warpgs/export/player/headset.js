@@ -50,6 +50,7 @@ async function enter(mode) {
   cancelAnimationFrame(state.request);
   session.onend = () => {
     Object.assign(headset, {session: null, stage: null, hands: []});
+    dome.hidden = false;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     offer();
     state.changed = true;
@@ -61,7 +62,8 @@ async function enter(mode) {
   const layer = new XRWebGLLayer(session, gl, {antialias: false, depth: false, stencil: false});
   session.updateRenderState({baseLayer: layer});
   const space = await session.requestReferenceSpace('local');
-  const background = mode === 'immersive-ar' ? [0, 0, 0, 0] : [...START.background, 1];
+  dome.hidden = mode === 'immersive-ar';
+  const background = dome.hidden ? [0, 0, 0, 0] : [...START.background, 1];
   const show = (now, frame) => {
     session.requestAnimationFrame(show);
     const pose = frame.getViewerPose(space);

@@ -16,9 +16,9 @@ const canvas = element('canvas');
 const gl = canvas.getContext('webgl2', {alpha: false, antialias: false, preserveDrawingBuffer: true})
   || fail('This page needs WebGL2, which this browser does not support or has disabled.');
 
-function compiled() {
+function compiled(vertexId, fragmentId) {
   const program = gl.createProgram();
-  for (const [type, id] of [[gl.VERTEX_SHADER, 'vertex-shader'], [gl.FRAGMENT_SHADER, 'fragment-shader']]) {
+  for (const [type, id] of [[gl.VERTEX_SHADER, vertexId], [gl.FRAGMENT_SHADER, fragmentId]]) {
     const shader = gl.createShader(type);
     gl.shaderSource(shader, element(id).textContent.trim());
     gl.compileShader(shader);
@@ -31,7 +31,7 @@ function compiled() {
   return program;
 }
 
-const program = compiled();
+const program = compiled('vertex-shader', 'fragment-shader'), DOME_UNIT = 6; // after those of textures below
 const uniform = (name) => gl.getUniformLocation(program, name);
 gl.useProgram(program);
 
@@ -149,6 +149,7 @@ function draw({rotation: r, position}, [fx, fy, cx, cy], [left, bottom, width, h
   // Draws the sorted Gaussians through a camera into a part of the framebuffer, from whose upper left corner cx, cy count.
   const t = r.map((row) => -dot(row, position));
   gl.viewport(left, bottom, width, height);
+  drawDome({rotation: r}, [fx, fy, cx, cy], [left, bottom, width, height]);
   gl.uniform1f(uniforms.position, state.time * lastKey);
   gl.uniform2f(uniforms.viewport, width, height);
   gl.uniform4f(uniforms.intrinsics, fx, fy, cx, cy);
@@ -223,7 +224,7 @@ function frame(now) {
   state.request = requestAnimationFrame(frame);
 }
 
-upload().then((means) => {
+Promise.all([upload(), loadDome()]).then(([means]) => {
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
   gl.enableVertexAttribArray(0);
   gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 4, 0);
