@@ -210,10 +210,14 @@ class Camera:
             return torch.cat([slopes, torch.ones_like(slopes[:, :1])], 1)
         return self.distortion.rays(slopes)
 
-    def directions(self) -> Float[Tensor, "P 3"]:
-        """[H W, 3] directions in the world that pixels show, row by row, of any length; NaN where nothing is seen."""
+    def directions(self, rays: Float[Tensor, "P 3"] | None = None) -> Float[Tensor, "P 3"]:
+        """[H W, 3] directions in the world that pixels show, row by row, of any length; NaN where nothing is seen.
+
+        Args:
+            rays: [H W, 3] ``rays`` of the pixels; None to compute them.
+        """
         positions = self.pixel_centers
-        viewed = self.rays(positions)
+        viewed = self.rays(positions) if rays is None else rays
         if self.motion is not None:
             turn = torch.stack([self.motion[0], torch.zeros_like(self.motion[1])])
             viewed = at_middle_row(viewed, turn, self._readout(positions))

@@ -51,14 +51,18 @@ def parameters_after_steps(data, run, **changes):
 
 
 @pytest.mark.parametrize("fields", [{}, {"radial_distortion": [0.1, 0.01, 0.0]}, {"fisheye_distortion": [0.05]}])
-@pytest.mark.parametrize("resident_bytes", [1 << 30, 0])
-def test_replayed_steps_change_parameters_as_eager_steps_do(data, tmp_path, resident_bytes, fields):
+@pytest.mark.parametrize(("resident_bytes", "background"), [(1 << 30, "black"), (0, "black"), (1 << 30, "sky")])
+def test_replayed_steps_change_parameters_as_eager_steps_do(data, tmp_path, resident_bytes, background, fields):
     """Up to noise: the GPU adds gradients in an order that varies, and Adam amplifies tiny ones."""
     data = shutil.copytree(data, tmp_path / "capture")
     for path in (data / "camera").iterdir():
         edit_json(path, **fields)
-    eager, again = (parameters_after_steps(data, tmp_path / f"eager{k}", graph=False) for k in range(2))
-    replayed = parameters_after_steps(data, tmp_path / "replayed", graph=True, resident_bytes=resident_bytes)
+    eager, again = (
+        parameters_after_steps(data, tmp_path / f"eager{k}", graph=False, background=background) for k in range(2)
+    )
+    changes = {"graph": True, "resident_bytes": resident_bytes, "background": background}
+    replayed = parameters_after_steps(data, tmp_path / "replayed", **changes)
+    assert ("dome.texels" in replayed) == (background == "sky")
     for name, expected in eager.items():
         if expected.any():
             noise = relative_error(again[name], expected)
@@ -73,8 +77,9 @@ def test_a_run_with_graphs_passes_all_stages(data, tmp_path, strategy):
     assert all(p.isfinite().all() for p in trainer.scene.parameters())
 
 
-def test_a_played_frame_equals_the_rendered_one(data, tmp_path):
-    trainer = trainer_on_cuda(data, tmp_path / "run")
+@pytest.mark.parametrize("background", ["mean", "sky"])
+def test_a_played_frame_equals_the_rendered_one(data, tmp_path, background):
+    trainer = trainer_on_cuda(data, tmp_path / "run", background=background)
     tiny.train(trainer)
     metadata = Metadata(iteration=tiny.LENGTH, use_deformation=True, use_appearance=True, sh_degree=1)
     scene = TrainedScene(trainer.scene, trainer.config, metadata)

@@ -8,10 +8,13 @@ import pytest
 import torch
 
 from tests import plain, tiny
+from tests.lens_captures import CAMERAS, recorded
 from warpgs.captures.opening import load_capture
 from warpgs.evaluation import evaluate_run
 from warpgs.evaluation.image_quality import psnr
+from warpgs.initialization.prepare_start import prepare_start
 from warpgs.model.dome import Dome
+from warpgs.rendering import Layer, Rendering
 from warpgs.runs import checkpoint
 from warpgs.runs.opening import open_run
 from warpgs.runs.run import Run
@@ -134,3 +137,25 @@ def test_held_out_views_show_the_sky_better_than_gaussians_in_its_place(outside,
         images = [(scene.render(frame.camera).joint.image, frame.image / 255.0) for frame in frames]
         quality.append(sum(psnr(*pair, sky) for pair, sky in zip(images, skies, strict=True)) / 2)
     assert quality[0] > quality[1] + 5.0
+
+
+@pytest.mark.usefixtures("quickly")
+def test_a_step_looks_at_the_sky_through_the_lens_of_its_view(tmp_path):
+    capture = recorded("fisheye")
+    camera = dataclasses.replace(capture.cameras[capture.train[1]], distortion=CAMERAS["radial"].distortion)
+    capture = capture.with_cameras({capture.train[1]: camera})
+    trainer = tiny.Trainer(prepare_start(dataclasses.replace(CONFIG, background="sky"), capture), tmp_path)
+    step, dome = trainer.step, trainer.scene.dome
+    for index in range(3):
+        step.views.select(index)
+        view = step.views.selected()
+        empty = torch.zeros(view.camera.height, view.camera.width)
+        layer = Layer(torch.zeros(*empty.shape, 3), empty, None)
+        seen = step._under_sky(dome, Rendering(layer, layer, layer, *4 * [None]), view)
+        expected = dome(capture.cameras[capture.train[index]])
+        assert torch.allclose(seen.joint.image, expected, atol=1e-4)
+        assert torch.equal(seen.static.image, seen.joint.image)
+        assert not seen.dynamic.image.any()
+        dome.texels.grad = None
+        seen.joint.image.sum().backward()
+        assert dome.texels.grad.any()

@@ -48,10 +48,13 @@ class Dome(nn.Module):
         self.texels = nn.Parameter(torch.zeros(3, ROWS, COLUMNS, dtype=torch.float32) if texels is None else texels)
         self.register_buffer("far", torch.tensor(far, dtype=torch.float32))
 
-    def forward(self, camera: Camera) -> Float[Tensor, "H W 3"]:
-        """The colours that a camera sees where nothing is in front; poses get no gradient."""
+    def forward(self, camera: Camera, rays: Float[Tensor, "P 3"] | None = None) -> Float[Tensor, "H W 3"]:
+        """The colours that a camera sees where nothing is in front; poses get no gradient.
+
+        ``rays`` are those of ``Camera.directions``.
+        """
         _, rows, columns = self.texels.shape
-        column, row = torch.unbind(positions(camera, rows, columns), -1)
+        column, row = torch.unbind(positions(camera, rows, columns, rays), -1)
         wrapped = torch.cat([self.texels[..., -1:], self.texels, self.texels[..., :1]], 2)
         grid = torch.stack([2.0 * (column + 1.0) / (columns + 1.0), 2.0 * row / (rows - 1.0)], -1) - 1.0
         return grid_sample(wrapped[None], grid[None], "bilinear", "border", align_corners=True)[0].permute(1, 2, 0)
@@ -70,9 +73,11 @@ class Dome(nn.Module):
 
 
 @torch.no_grad()
-def positions(camera: Camera, rows: int, columns: int) -> Float[Tensor, "H W 2"]:
+def positions(
+    camera: Camera, rows: int, columns: int, rays: Float[Tensor, "P 3"] | None = None
+) -> Float[Tensor, "H W 2"]:
     """(column, row) of the colour that each pixel of a camera shows, 0 at the centre of the first texel."""
-    x, y, z = camera.directions().nan_to_num(0.0).unbind(1)
+    x, y, z = camera.directions(rays).nan_to_num(0.0).unbind(1)
     column = (torch.atan2(y, x) / (2.0 * math.pi)).remainder(1.0) * columns - 0.5
     row = (0.5 - torch.atan2(z, torch.hypot(x, y)) / math.pi) * rows - 0.5
     return torch.stack([column, row], 1).view(camera.height, camera.width, 2)

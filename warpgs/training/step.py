@@ -104,6 +104,7 @@ class Step:
         sums = (*TERMS, "psnr", STEPS)
         self._inputs = StepInputs(sums, optim.GROUPS, device)
         self._background = torch.tensor(background_color(views.background), dtype=torch.float32, device=device)
+        self._rays = None if scene.dome is None else views.lens_rays()
         self._sums = torch.zeros(len(sums), dtype=torch.float32, device=device)
         self._counts: Counter[str] = Counter()  # iterations with each term since the last check, and of all
         self._zero, self._one = (
@@ -208,7 +209,7 @@ class Step:
         """The sky behind the joint and the static image; it learns from static pixels that may show it."""
         (scale, offset), _ = self._depth_of_view()
         hidden = dome.hidden(scale * view.inverse_depth + offset) | ~view.static_mask
-        colors = dome(view.camera)
+        colors = dome(view.camera, None if self._rays is None else self._rays.at(self.views.index))
         colors = torch.where(hidden[..., None], colors.detach(), colors)
         return rendering._replace(dynamic=None).under(colors)._replace(dynamic=rendering.dynamic)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -62,6 +62,33 @@ class StackedCameras:
         duration, by_columns = self._readouts[number]
         shutter: dict[str, Any] = {"motion": motion, "duration": duration, "by_columns": by_columns}
         return Camera(viewmat, K, *size, distortion=distortion, **shutter)
+
+
+class LensRays:
+    """``Camera.rays`` of the pixels of cameras with distorted lenses: finding them takes longer than a training step.
+
+    Args:
+        cameras: Of one size.
+        device: Device of the rays.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], device: torch.device) -> None:
+        found: dict[tuple[object, ...], int] = {}
+        rays: list[Tensor] = []
+        of_cameras: list[int] = []
+        for camera in cameras:
+            kind = None if camera.distortion is None else (camera.distortion.lens, camera.distortion.limit)
+            key = (kind, *camera.K.flatten().tolist(), *_intrinsics(camera))
+            if key not in found:
+                found[key] = len(rays)
+                on_device = camera.to(device)
+                rays.append(on_device.rays(on_device.pixel_centers))
+            of_cameras.append(found[key])
+        self._rays, self._of_cameras = torch.stack(rays), torch.tensor(of_cameras, device=device)
+
+    def at(self, index: Int64[Tensor, "1"]) -> Float[Tensor, "P 3"]:
+        """[H W, 3] those of the camera of an index on the device."""
+        return self._rays.index_select(0, self._of_cameras.index_select(0, index))[0]
 
 
 def _shown(cameras: Sequence[Camera], device: torch.device) -> list[Bool[Tensor, "H W"] | None]:

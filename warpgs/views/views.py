@@ -18,7 +18,7 @@ from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
 from .pixels import BYTES_PER_PIXEL, Pixels
-from .stacked_cameras import StackedCameras
+from .stacked_cameras import LensRays, StackedCameras
 from .view_cache import ViewCache
 from .view_reader import Slot, ViewReader
 
@@ -238,6 +238,13 @@ class Views:
         cameras = [self._capture.cameras[name].to(self.device) for name in self._capture.train]
         indices = torch.arange(len(self), device=self.device).split(1)
         return [self._corrected(*pair) for pair in zip(cameras, indices, strict=True)]
+
+    def lens_rays(self) -> LensRays | None:
+        """What each pixel of the views sees; None for pinholes and for images of several sizes."""
+        cameras = [self._capture.cameras[name] for name in self._capture.train]
+        is_pinhole = all(camera.distortion is None for camera in cameras)
+        have_one_size = len({camera.size for camera in cameras}) == 1
+        return None if is_pinhole or not have_one_size else LensRays(cameras, self.device)
 
     def _corrected(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
         return camera if self.poses is None else self.poses.moved(camera, index)
