@@ -116,7 +116,18 @@ def test_colours_begin_as_frames_show_them_and_go_on_around_them(dome):
     assert torch.equal(seen_colors([], 4, 8), torch.full((3, 4, 8), 0.5))
 
 
-def test_a_camera_that_sees_nothing_at_a_pixel_gets_a_finite_colour(dome):
+def test_pixels_in_which_the_lens_sees_nothing_tell_no_colour():
+    camera = dataclasses.replace(
+        CAMERAS["fisheye"], distortion=dataclasses.replace(CAMERAS["fisheye"].distortion, circle=0.5)
+    )
+    shown = camera.shown
+    assert not shown.all()
+    image = torch.where(shown[..., None], torch.ones(*shown.shape, 3), 0.0)
+    colors = seen_colors([(camera, image, torch.ones_like(shown))], 16, 32)
+    assert torch.allclose(colors, torch.ones(3, 16, 32))
+
+
+def test_a_camera_that_is_not_finite_sees_finite_colours(dome):
     camera = dataclasses.replace(CAMERAS["fisheye"], viewmat=torch.full((4, 4), torch.nan))
     assert dome(camera).isfinite().all()
 

@@ -95,7 +95,8 @@ def seen_colors(
     """
     total = torch.zeros(rows * columns, 4, dtype=torch.float64)
     for camera, image, mask in seen:
-        column, row = (positions(camera, rows, columns)[mask].round().long()).unbind(1)
+        mask = mask & camera.directions().isfinite().all(1).view_as(mask)
+        column, row = positions(camera, rows, columns)[mask].round().long().unbind(1)
         texel = row.clamp(0, rows - 1) * columns + column % columns
         total.index_add_(0, texel, torch.cat([image[mask], torch.ones(len(texel), 1)], 1).double())
     return _filled(total.view(rows, columns, 4)).permute(2, 0, 1).float().contiguous()
