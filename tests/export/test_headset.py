@@ -132,6 +132,33 @@ def test_the_scene_stands_upright_whatever_the_pitch_of_the_first_view(emulated,
     assert np.allclose(position, [0.0, -1.8, -2.4], atol=1e-6)
 
 
+@pytest.mark.parametrize("lying", ["camera", "head"])
+def test_the_scene_stands_upright_if_the_first_view_or_the_head_lies_on_its_side(emulated, baked, tmp_path, lying):
+    rolled = [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]
+    first = dataclasses.replace(start(), viewmat=rolled) if lying == "camera" else start()
+    opened(emulated, tmp_path, baked, first)
+    if lying == "head":
+        emulated.value("device.quaternion.set(0, 0, Math.SQRT1_2, Math.SQRT1_2)")
+    enter(emulated)
+    level = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
+    assert np.allclose(emulated.value(f"headset.stage.camera({level}).rotation"), np.eye(3), atol=1e-6)
+
+
+def test_a_headset_is_offered_once_there_is_something_to_show(emulated, baked, tmp_path):
+    write_page(tmp_path / "scene.html", baked, start())
+    setup = emulated._first
+    emulated.on_open(
+        setup + ";window.read = Response.prototype.arrayBuffer; Response.prototype.arrayBuffer = "
+        "function () { return new Promise((done) => { window.go = () => done(read.call(this)); }); };"
+    )
+    emulated.open(f"file://{tmp_path / 'scene.html'}#play=0")
+    emulated.until("typeof window.go === 'function'")
+    assert emulated.value("new Promise((done) => setTimeout(() => done(element('vr').hidden), 300))")
+    emulated.value("Response.prototype.arrayBuffer = read, go()")
+    emulated.until("!element('vr').hidden")
+    emulated.on_open(setup)
+
+
 def test_the_frustum_of_an_eye_need_not_be_symmetric(browser, baked, tmp_path):
     opened(browser, tmp_path, baked, start())
     left, right, bottom, top = -0.9, 0.7, -0.8, 1.1  # at a distance of 1

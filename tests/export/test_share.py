@@ -42,6 +42,14 @@ def test_addresses_are_absolute_if_that_of_the_folder_is_known(url):
     assert "og:url" not in unknown
 
 
+def test_names_that_are_not_utf8_are_written_as_they_can_be(path, clouds):
+    page = path.with_name("a\udcff.html")
+    write_page(page, bake(clouds.at, [0.0]), start("b\udcff"), url="https://example.org")
+    shown = properties(page.read_text())
+    assert shown["og:title"] == "b?"
+    assert shown["og:url"] == "https://example.org/a%FF.html"
+
+
 def test_a_title_cannot_leave_its_attribute():
     title = '"><script>alert(1)</script>'
     text = card(start(title), 60, NAME, "https://example.org")
@@ -51,10 +59,19 @@ def test_a_title_cannot_leave_its_attribute():
 
 @pytest.mark.parametrize(
     "url",
-    ["example.org", "ftp://example.org", "https://", "https://a b", 'https://a/"><b>', "https://a/?b", "https://[a"],
+    [
+        "example.org",
+        "ftp://example.org",
+        "https://",
+        "https://a b",
+        'https://a/"><b>',
+        "https://a/?b",
+        "https://[a",
+        "https://a/b.html",
+    ],
 )
 def test_an_address_that_is_none_is_refused(url):
-    with pytest.raises(ValueError, match="--url must be an address such as https"):
+    with pytest.raises(ValueError, match="--url must be the address of a folder, such as https"):
         check_url(url)
 
 

@@ -652,6 +652,14 @@ def test_a_training_that_is_followed_is_not_edited(run):
     assert not (run / NAME).exists()
 
 
+def test_nothing_is_selected_in_a_training_that_is_followed_whatever_a_browser_sends(run):
+    """Its Gaussians change with each checkpoint."""
+    cleanup = visited(open_source(run, "cpu", True))
+    cleanup.controls.tool.value = RECTANGLE
+    drag(cleanup, (0.0, 0.0), (1.0, 1.0))
+    assert cleanup.selection.selected is None
+
+
 def test_a_box_has_twelve_edges_along_its_axes():
     edges = box_edges(np.zeros(3, np.float32), np.float32([1, 2, 3]))
     along = np.abs(edges[:, 1] - edges[:, 0])

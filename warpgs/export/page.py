@@ -46,6 +46,9 @@ MAX_GAUSSIANS = 1 << 22
 DIFFERENCES = "means"
 """The part whose lowest coefficients are stored as differences: neighbours along the Morton curve are close."""
 
+MAX_TITLE = 200
+"""Maximum number of characters of a title; services that show links cut longer ones."""
+
 PLACEHOLDER = re.compile(r"\[\[([a-z.]+)\]\]")
 """Marks where the player's page includes another of its files, the title or the scene."""
 
@@ -86,7 +89,8 @@ def write_page(
     blocks += [_packed(f"{name}-octaves", branch.octaves[None, :, None]) for name, branch in branches.items()]
     blocks += [] if sky is None else [_block("image/png", "sky", to_text(encode_png(sky)))]
     shared = card(start, len(baked.static) + len(baked.dynamic), path, url)
-    return write_bytes(path, [_player(start.title, shared, "\n".join(blocks)).encode()])
+    # Characters of names that are not UTF-8 have no place in a page; browsers show question marks.
+    return write_bytes(path, [_player(start.title, shared, "\n".join(blocks)).encode(errors="replace")])
 
 
 def _content(baked: Baked, start: StartView) -> str:
@@ -102,10 +106,6 @@ def _content(baked: Baked, start: StartView) -> str:
         },
     }
     return json.dumps(metadata, allow_nan=False).replace("<", "\\u003c")
-
-
-MAX_TITLE = 200
-"""Maximum number of characters of a title; services that show links cut longer ones."""
 
 
 def check_size(counts: Mapping[str, int], keys: int) -> None:

@@ -5,6 +5,7 @@ absolute addresses of pictures.
 """
 
 import html
+import os
 import re
 from pathlib import Path
 from urllib.parse import quote
@@ -50,8 +51,8 @@ def check_url(url: str) -> None:
     Raises:
         ValueError: If it is not.
     """
-    if not ADDRESS.fullmatch(url):
-        raise ValueError(f"--url must be an address such as https://example.org/scenes, got {url!r}")
+    if not ADDRESS.fullmatch(url) or url.endswith((".html", ".htm")):
+        raise ValueError(f"--url must be the address of a folder, such as https://example.org/scenes, got {url!r}")
 
 
 def card(start: StartView, count: int, page: Path, url: str | None) -> str:
@@ -69,12 +70,12 @@ def card(start: StartView, count: int, page: Path, url: str | None) -> str:
         "og:type": "website",
         "og:title": start.title,
         "og:description": description,
-        "og:image": folder + quote(picture_path(page).name),
+        "og:image": folder + quote(os.fsencode(picture_path(page).name)),
         "og:image:width": SIZE[0],
         "og:image:height": SIZE[1],
     }
     if url is not None:
-        properties["og:url"] = folder + quote(page.name)
+        properties["og:url"] = folder + quote(os.fsencode(page.name))
     lines = [f'<meta name="description" content="{description}">']
     lines += [f'<meta property="{name}" content="{html.escape(str(value))}">' for name, value in properties.items()]
     return "\n".join([*lines, '<meta name="twitter:card" content="summary_large_image">'])

@@ -127,8 +127,8 @@ class Cleanup:
 
     @property
     def whole(self) -> TrainedScene | None:
-        """The scene without edits; None before the first checkpoint of a training."""
-        return self._source.current()
+        """The scene without edits; None if it cannot be edited."""
+        return self._source.current() if self._can_edit else None
 
     def say(self, text: str) -> None:
         """Shows a line about what was selected."""

@@ -38,7 +38,7 @@ class Editor(Protocol):
 
     @property
     def whole(self) -> TrainedScene | None:
-        """The scene without edits; None before there is one."""
+        """The scene without edits; None if it cannot be edited."""
 
     def say(self, text: str) -> None:
         """Shows a line."""
@@ -153,7 +153,7 @@ class Selection:
             self._set(mask)
 
     def _mask(self) -> Bool[np.ndarray, " N"] | None:
-        """What is selected, of the Gaussians of the scene without edits; None before there is one."""
+        """What is selected, of the Gaussians of the scene without edits; None if it cannot be edited."""
         if self.selected is not None:
             return self.selected.mask
         whole = self._editor.whole

@@ -4,14 +4,22 @@ const FIT = 1.5;                                       // distance of what the f
 const METRES = START.metres || FIT / START.pivot;      // per scene unit, at first
 const WALK = 1, SCRUB = 0.25;                          // speeds of the thumbsticks [m/s], [durations/s]
 const BAR = {left: -0.2, bottom: -0.33, width: 0.4, height: 0.012, distance: -1, seconds: 2}; // seen from the head [m]
+const LEVEL = 0.1;                                     // least horizontal part of an axis that tells a heading
 const columns = (matrix) => [0, 4, 8, 12].map((k) => Array.from(matrix.slice(k, k + 3)));
+
+function headingOf(head) {
+  // The horizontal direction to the right of a head, by its back where it lies on its side.
+  const [right, , back] = columns(head), isLevel = Math.hypot(right[0], right[2]) > LEVEL;
+  return normalized(isLevel ? [right[0], 0, right[2]] : [back[2], 0, -back[0]]);
+}
 
 class Stage {
   // Where the room is in the scene: its axes, its origin, and metres per scene unit.
   constructor(camera, up, metres, head) {
     // The head gets the place of the camera and its heading, and stays upright.
-    const x = normalized(addScaled(camera.rotation[0], up, -dot(camera.rotation[0], up))), back = cross(x, up);
-    const [right, , , place] = columns(head), [cos, , sin] = normalized([right[0], 0, right[2]]);
+    const side = addScaled(camera.rotation[0], up, -dot(camera.rotation[0], up)), isLevel = Math.hypot(...side) > LEVEL;
+    const x = normalized(isLevel ? side : cross(camera.rotation[2], up)), back = cross(x, up); // a camera may lie on its side
+    const [, , , place] = columns(head), [cos, , sin] = headingOf(head);
     this.axes = [addScaled(x.map((v) => v * cos), back, -sin), up, addScaled(x.map((v) => v * sin), back, cos)];
     this.metres = metres;
     this.origin = addScaled(camera.position, this.turned(place), -1 / metres);
@@ -91,7 +99,7 @@ function look(frame, space, pose, seconds, layer, background) {
 }
 
 function steer(frame, space, seconds) {
-  const hands = [], {head} = headset, x = normalized([head[0], 0, head[2]]);
+  const hands = [], {head} = headset, x = headingOf(head);
   let pressed = false;
   for (const {gamepad, gripSpace, handedness} of headset.session.inputSources) {
     if (!gamepad) continue;
@@ -167,5 +175,7 @@ function offer() {
     navigator.xr?.isSessionSupported(mode).then((supported) => { button.hidden = !supported; }, () => {});
   }
 }
-navigator.xr?.addEventListener('devicechange', offer);
-offer();
+loaded.then(() => { // a session that began before would share the canvas with the loop that begins then
+  navigator.xr?.addEventListener('devicechange', offer);
+  offer();
+}, () => {});

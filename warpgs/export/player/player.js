@@ -224,7 +224,7 @@ function frame(now) {
   state.request = requestAnimationFrame(frame);
 }
 
-Promise.all([upload(), loadDome()]).then(([means]) => {
+const loaded = Promise.all([upload(), loadDome()]).then(([means]) => {
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
   gl.enableVertexAttribArray(0);
   gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 4, 0);
