@@ -289,7 +289,7 @@ def test_a_page_contains_no_address(text):
 def test_a_title_is_escaped(path, baked, title):
     write_page(path, baked, start(title))
     text = path.read_text()
-    assert text.count("<script") == 31
+    assert text.count("<script") == 33
     assert "<b>" not in text
     assert read_page(path).keys == KEYS
     assert json.loads(re.search(r'id="scene">([^<]*)<', text)[1])["start"]["title"] == title
