@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import threading
+from collections import Counter
 from collections.abc import Callable
 
 import cv2
@@ -16,15 +17,19 @@ from warpgs.captures.opening import load_capture
 from warpgs.data import dynamic_regions
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.dynamic_regions import unknown_depth
+from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.initialization import object_depth as module
 from warpgs.initialization import objects
 from warpgs.initialization.averaged_depth import without_rims
 from warpgs.initialization.depth_by_size import depth_by_size
+from warpgs.initialization.dynamic_points import NUM_CHECKED
+from warpgs.initialization.initialize import MAX_COLOR_VIEWS
 from warpgs.initialization.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth
 from warpgs.initialization.objects import MIN_VISIBLE, find_objects
 from warpgs.initialization.prepare_start import prepare_start
 from warpgs.runtime import launch
 from warpgs.training.trainer import Trainer
+from warpgs.views.view_reader import ViewReader
 from warpgs.views.views import Views
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
@@ -578,6 +583,23 @@ def test_training_uses_the_depth_of_objects_without_pretraining(tmp_path):
     true = torch.cat([image[image.isfinite()] for image in object_depth(capture).values()])
     assert true.min() - 1e-3 <= z.min()
     assert z.max() <= true.max() + 1e-3
+
+
+def test_what_comes_before_training_reads_each_view_once(monkeypatch):
+    """And a few of them again, which tell whether depth is known."""
+    reads, read = Counter(), ViewReader._pixels
+
+    def counted(reader, index, *arguments, **options):
+        reads[index] += 1
+        return read(reader, index, *arguments, **options)
+
+    monkeypatch.setattr(ViewReader, "_pixels", counted)
+    start = prepare_start(dataclasses.replace(CONFIG, resident_bytes=0), capture_of(MASKS))
+    assert start.num_with_objects == NUM
+    few = {*evenly_spaced_indices(NUM, NUM_CHECKED), *evenly_spaced_indices(NUM, MAX_COLOR_VIEWS)}
+    assert {index: reads[index] for index in range(NUM) if index not in few} == {
+        index: 1 for index in range(NUM) if index not in few
+    }
 
 
 def test_a_capture_with_depth_pretrains(tmp_path):

@@ -48,8 +48,8 @@ def test_views_come_back_bit_for_bit(tmp_path, border, depth):
     for k in (2, 0, 1):
         cache.store(k, views[k])
     for k in (1, 2, 0, 1):
-        assert_equal(cache.load(k, pinned=False), views[k])
-    size = cache._file.seek(0, 2)
+        assert_equal(cache.load(k, pinned=False)[0], views[k])
+    size = sum(file.seek(0, 2) for file in cache._files)
     assert size == cache.nbytes if border and depth else size < cache.nbytes
 
 
@@ -70,23 +70,28 @@ def test_a_view_that_was_never_stored_is_missing(cache):
     assert cache.load(1, pinned=False) is None
 
 
-def test_a_stored_view_is_only_overwritten_on_request(cache):
+def test_a_stored_view_is_only_overwritten_on_request_or_by_one_with_more_changes(cache):
     second = pixels(2)._replace(inverse_depth=pixels(0).inverse_depth * 2)
     assert cache.store(0, second)
-    assert_equal(cache.load(0, pinned=False), pixels(0))
+    assert_equal(cache.load(0, pinned=False)[0], pixels(0))
     assert cache.store(0, second, replace=True)
-    assert_equal(cache.load(0, pinned=False), second)
+    assert_equal(cache.load(0, pinned=False)[0], second)
+    assert cache.store(0, pixels(0), version=1)
+    assert cache.store(0, second, version=0)
+    found, version = cache.load(0, pinned=False)
+    assert_equal(found, pixels(0))
+    assert version == 1
 
 
-def test_a_disk_that_becomes_full_keeps_what_was_stored_before(cache, monkeypatch):
+def test_a_disk_that_becomes_full_keeps_what_was_stored_before(cache):
     def write(data):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    file = cache._file
-    monkeypatch.setattr(cache, "_file", SimpleNamespace(write=write, seek=file.seek, readinto=file.readinto))
+    file = cache._files[1]
+    cache._files[1] = SimpleNamespace(write=write, seek=file.seek, readinto=file.readinto)
     assert not cache.store(1, pixels(1))
     assert cache.load(1, pinned=False) is None
-    assert_equal(cache.load(0, pinned=False), pixels(0))
+    assert_equal(cache.load(0, pinned=False)[0], pixels(0))
 
 
 def test_a_disk_without_room_stores_nothing(tmp_path, monkeypatch):
@@ -102,11 +107,11 @@ def test_what_must_stay_free_is_kept_while_the_disk_fills(cache, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=SPARE_BYTES))
     cache.store(1, pixels(1))
     assert cache.load(1, pinned=False) is None
-    assert_equal(cache.load(0, pinned=False), pixels(0))
+    assert_equal(cache.load(0, pinned=False)[0], pixels(0))
 
 
 def test_a_cut_file_is_an_error(cache):
-    cache._file.truncate(3)
+    cache._files[0].truncate(3)
     with pytest.raises(OSError, match="cannot be read"):
         cache.load(0, pinned=False)
 
@@ -207,6 +212,6 @@ def test_a_view_that_is_being_replaced_is_read_before_or_after(cache):
     with ThreadPoolExecutor(2) as pool:
         writes = [pool.submit(cache.store, 0, views[k % 2], replace=True) for k in range(200)]
         for _ in range(200):
-            found = cache.load(0, pinned=False)
+            found, _ = cache.load(0, pinned=False)
             assert_equal(found, views[int(found.inverse_depth.isnan().all())])
     assert all(write.result() for write in writes)

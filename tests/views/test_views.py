@@ -1,6 +1,7 @@
 """Training views are the same whether they are resident or read on demand."""
 
 import dataclasses
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from tests.data.captures import ids_of, write_capture
 from tests.scenes import along_z
 from warpgs.cameras import Camera
 from warpgs.captures.opening import load_capture
-from warpgs.data.capture import Capture
+from warpgs.data.capture import Capture, Frame
+from warpgs.data.dynamic_regions import dynamic_counts
 from warpgs.distortion import Distortion
 from warpgs.model.poses import PoseCorrections
+from warpgs.views import views as module
 from warpgs.views.pixels import mask_border
 from warpgs.views.stacked_cameras import StackedCameras
 from warpgs.views.views import Views
@@ -348,3 +351,47 @@ def test_a_factor_changes_aligned_inverse_depth(capture, resident_bytes):
     expected = (2.0 * before + 0.5) * factor
     torch.testing.assert_close(2.0 * views[1].inverse_depth + 0.5, expected, rtol=3e-3, atol=0.0, equal_nan=True)
     assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), other.nan_to_num(-1.0))
+
+
+@pytest.mark.parametrize("resident_bytes", [PLENTY, 0])
+def test_a_glance_holds_the_mask_and_a_small_image_of_a_view(capture, resident_bytes):
+    views = views_of(capture, resident_bytes)
+    for glance, view, name in zip(views.glances, views, capture.train, strict=True):
+        assert torch.equal(glance.static_mask, view.static_mask)
+        assert glance.counts == dynamic_counts(view.static_mask, view.camera)
+        assert glance.has_depth == (capture.frame(name).inverse_depth is not None)
+        assert glance.colors.shape[:2] == glance.is_static.shape
+        assert abs(glance.colors / 255.0 - view.image.numpy()).mean() < 0.5
+        assert glance.is_static.all() == view.static_mask.all()
+
+
+@pytest.mark.parametrize("resident_bytes", [PLENTY, 0])
+def test_of_many_views_those_of_a_sample_are_worked_on(capture, resident_bytes, monkeypatch):
+    monkeypatch.setattr(module, "MANY", 3)
+    monkeypatch.setattr(module, "SAMPLED", 3)
+    views = views_of(capture, resident_bytes)
+    expected = views.sample
+    assert len(expected) == 3 < len(views)
+    assert [int(time * 1e6) for (time,) in views.map(lambda view: (view.time,))] == [
+        int(views.time(index) * 1e6) for index in expected
+    ]
+    cameras = views.cameras()
+    assert [torch.equal(found.viewmat, views.camera(k).viewmat) for found, k in zip(cameras, expected, strict=True)]
+    assert len(cameras) == 3
+
+
+def test_the_sample_of_many_views_is_spread_over_cameras_and_times(monkeypatch):
+    monkeypatch.setattr(module, "MANY", 100)
+    monkeypatch.setattr(module, "SAMPLED", 60)
+    names = [f"{camera}-{time}" for time in range(50) for camera in range(6)]
+    cameras = {
+        name: dataclasses.replace(along_z(20.0, (6, 5)), id=int(name[0]), time=int(name[2:]) / 49.0) for name in names
+    }
+    static, image = torch.ones(5, 6, dtype=torch.bool), torch.zeros(5, 6, 3, dtype=torch.uint8)
+    capture = Capture(
+        "rig", cameras, names, [], torch.zeros(0, 3), None, lambda name: Frame(name, cameras[name], image, static)
+    )
+    sample = Views(capture, CPU, 0).sample
+    assert sample == sorted({*sample})
+    assert [*Counter(index % 6 for index in sample).values()] == [10] * 6
+    assert len({index // 6 for index in sample}) > 25

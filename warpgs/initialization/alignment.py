@@ -1,5 +1,6 @@
 """The alignment of the views' depth to the scene, and how much it is trusted."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -62,8 +63,8 @@ class DepthAlignment(NamedTuple):
 
 def require_no_depth(capture: Capture, views: Views) -> None:
     """Raises ValueError if a training view has depth: a capture is to be read without where the config is without."""
-    for name, view in zip(capture.train, views, strict=True):
-        if bool(view.inverse_depth.isfinite().any()):
+    for name, glance in zip(capture.train, views.glances, strict=True):
+        if glance.has_depth:
             raise ValueError(
                 f"{capture.name}: frame {name} was read with depth, but the config is without (depth=False); open the "
                 "capture with open_capture(config)"
@@ -85,7 +86,8 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
     errors = torch.full((len(views), 2), torch.inf, dtype=torch.float32, device=views.device)
     plain = errors[:, 0].clone()
     points = capture.points.to(views.device)
-    for batch in _batches(views, len(points)):
+    known = [index for index, glance in enumerate(views.glances) if glance.has_depth]
+    for batch in _batches(views, len(points), known):
         samples = []
         for view in views.each(batch):
             samples.append(depth_alignment.sample_points(view.inverse_depth, view.static_mask, view.camera, points))
@@ -113,7 +115,7 @@ def align_to_rendering(
     splats = scene.static_splats(sh_degree)
     settings = replace(settings, depth=True)
     found = []
-    for batch in _batches(views, views.num_pixels // len(views)):
+    for batch in _batches(views, views.num_pixels // len(views), range(len(views))):
         samples = []
         for view in views.each(batch):
             layer = render(splats, view.camera, settings=settings).joint
@@ -125,8 +127,8 @@ def align_to_rendering(
     return torch.where(aligned.isfinite(), aligned, alignments)
 
 
-def _batches(views: Views, samples_per_view: int) -> list[list[int]]:
-    """Indices of all views, divided into those that are fitted at once."""
+def _batches(views: Views, samples_per_view: int, chosen: Sequence[int]) -> list[list[int]]:
+    """Indices of some views, divided into those that are fitted at once."""
     most = MAX_SAMPLES_ON_GPU if views.device.type == "cuda" else MAX_SAMPLES_ON_CPU
-    indices = torch.arange(len(views)).split(max(1, most // max(1, samples_per_view)))
-    return [batch.tolist() for batch in indices]
+    count = max(1, most // max(1, samples_per_view))
+    return [[*chosen[first : first + count]] for first in range(0, len(chosen), count)]

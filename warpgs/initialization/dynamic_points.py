@@ -18,9 +18,6 @@ from warpgs.views.views import View, Views
 
 from .point_cloud import gaussians_at, random_points, subsample, unproject
 
-MAX_VIEWS = 1_000
-"""Maximum number of views whose pixels dynamic Gaussians start from: more only take time."""
-
 MAX_PIXELS_PER_GAUSSIAN = 8
 """Maximum number of dynamic pixels that are unprojected per initial dynamic Gaussian."""
 
@@ -140,7 +137,7 @@ def unproject_pixels(
     max_count: int,
     generator: torch.Generator,
 ) -> DynamicPoints | None:
-    """At most ``max_count`` random pixels of masks of at most ``MAX_VIEWS`` views, unprojected by aligned depth.
+    """At most ``max_count`` random pixels of masks of the views of the ``sample``, unprojected by aligned depth.
 
     Where it is known at too few of them, they are put before the sparse points around them, if any are seen.
 
@@ -155,7 +152,7 @@ def unproject_pixels(
     Returns:
         The points; None if the masks are empty.
     """
-    chosen = _some_views(len(views), generator)
+    chosen = views.sample
     num = sum(int(mask_of(view).sum()) for view in views.each(chosen))
     if num == 0:
         return None
@@ -172,13 +169,6 @@ def unproject_pixels(
         found = _unproject(views, chosen, mask_of, estimated, fraction, generator)
     positions, colors, indices = found
     return DynamicPoints(positions, colors, indices, depth_known).chosen(subsample(positions, max_count, generator))
-
-
-def _some_views(num_views: int, generator: torch.Generator) -> Sequence[int]:
-    """At most ``MAX_VIEWS`` views: at random, so that each camera of several has others."""
-    if num_views <= MAX_VIEWS:
-        return range(num_views)
-    return torch.randperm(num_views, generator=generator)[:MAX_VIEWS].sort().values.tolist()
 
 
 def _unproject(

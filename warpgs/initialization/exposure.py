@@ -1,17 +1,13 @@
 """Jumps of exposure and white balance between the frames of a capture."""
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from warpgs.data.capture import Frame
 from warpgs.data.responses import BRIGHTEST, DARKEST, MIN_JUMP
+from warpgs.views.glance import Glance
 from warpgs.views.views import Views
-
-WIDTH = 64
-"""Frames are compared at this width [px], at which a few pixels of camera motion do not matter."""
 
 MIN_PIXELS = 50
 """Minimum number of compared pixels; between two frames with fewer, no jump is assumed."""
@@ -31,8 +27,8 @@ def exposure_gains(views: Views) -> Float[Tensor, "T 3"]:
     logs = torch.zeros(len(views), 3, dtype=torch.float32)
     for video in views.videos:
         log, before = torch.zeros(3, dtype=torch.float32), None
-        for k, frame in zip(video, views.frames(video), strict=True):
-            after = _log_intensities(frame)
+        for k in video:
+            after = _log_intensities(views.glances[k])
             if before is not None:
                 log = log + _jump(before, after)
             logs[k], before = log, after
@@ -41,14 +37,10 @@ def exposure_gains(views: Views) -> Float[Tensor, "T 3"]:
     return logs.exp()
 
 
-def _log_intensities(frame: Frame) -> np.ndarray:
+def _log_intensities(glance: Glance) -> np.ndarray:
     """[h, w, 3] logarithms of the small image; NaN where not compared."""
-    height, width = frame.image.shape[:2]
-    size = (min(WIDTH, width), max(1, round(height * min(WIDTH, width) / width)))
-    values = cv2.resize(frame.image.numpy(), size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
-    assert frame.static_mask is not None
-    static = cv2.resize(frame.static_mask.numpy().astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    values[static < 1.0] = np.nan
+    values = glance.colors.astype(np.float32) / 255.0
+    values[~glance.is_static] = np.nan
     values[(values < DARKEST) | (values > BRIGHTEST)] = np.nan
     return np.log(values)
 

@@ -80,7 +80,7 @@ def _set_depths(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"]
     if (num_cut := num_cut_off(objects)) is not None:
         return ObjectDepth(0, num_cut)
     for index, depth in depth_by_size(capture, views, objects).items():
-        if bool(views[index].inverse_depth.isnan().all()):
+        if not views.glances[index].has_depth:
             alignments[index] = alignments.new_tensor([1.0, 0.0])
         if bool(alignments[index].isfinite().all()):
             views.set_object_depth(index, alignments[index], depth)

@@ -58,9 +58,9 @@ def find_objects(views: Views, order: Sequence[int]) -> list[MovingObject]:
         views: The training views.
         order: Indices of those of one camera, by time or backward in time.
     """
-    follower = _Follower()
+    follower = _Follower(views)
     for index in order:
-        follower.add(index, views.frame(index))
+        follower.add(index)
     return follower.objects
 
 
@@ -75,6 +75,7 @@ def find_all_objects(views: Views) -> list[MovingObject]:
     """The objects that the masks show by time, then those backward in time: what parts later is told apart before."""
     orders = [order for video in views.videos for order in (video, video[::-1])]
     found: list[list[MovingObject]] = [[] for _ in orders]
+    _ = views.glances  # before threads ask for them
 
     def find(k: int) -> None:
         found[k] = find_objects(views, orders[k])
@@ -90,19 +91,20 @@ class _Follower:
         objects: All that were found.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, views: Views) -> None:
+        self._views = views
         self.objects: list[MovingObject] = []
-        self._before: Frame | None = None
+        self._before: int | None = None
         self._labels: Int[np.ndarray, "h w"] | None = None
 
-    def add(self, index: int, frame: Frame) -> None:
+    def add(self, index: int) -> None:
         """Goes on to the training frame of an index."""
-        assert frame.static_mask is not None
-        regions, alone = dynamic_regions(frame.static_mask, frame.camera), set()
-        labels = np.full(scaled_size(frame.camera)[::-1], NOTHING)
+        camera = self._views.camera(index)
+        regions, alone = dynamic_regions(self._views.glances[index].static_mask, camera), set()
+        labels = np.full(scaled_size(camera)[::-1], NOTHING)
         for region, candidates in zip(regions, self._candidates(regions), strict=True):
             if len(candidates) > 1 and not any(self.objects[k].is_mixture for k in candidates):
-                self._divide(region, candidates, frame, labels)
+                self._divide(region, candidates, index, labels)
             else:
                 label = candidates[0] if len(candidates) == 1 else self._new(is_mixture=len(candidates) > 1)
                 labels[region] = label
@@ -114,7 +116,7 @@ class _Follower:
                 item.cut.append(index)
             elif label in alone:
                 item.whole.append(index)
-        self._before, self._labels = frame, labels
+        self._before, self._labels = index, labels
 
     def _new(self, is_mixture: bool = False) -> int:
         self.objects.append(MovingObject(is_mixture=is_mixture))
@@ -133,12 +135,13 @@ class _Follower:
         return [np.flatnonzero(row).tolist() for row in linked]
 
     def _divide(
-        self, region: Bool[np.ndarray, "h w"], candidates: list[int], frame: Frame, labels: Int[np.ndarray, "h w"]
+        self, region: Bool[np.ndarray, "h w"], candidates: list[int], index: int, labels: Int[np.ndarray, "h w"]
     ) -> None:
         """Labels the pixels of a region of several objects by where optical flow leads to in the frame before."""
         assert self._before is not None
         assert self._labels is not None
-        carried = np.where(region, _carried(self._labels, self._before, frame), NOTHING)
+        before, frame = self._views.frame(self._before), self._views.frame(index)
+        carried = np.where(region, _carried(self._labels, before, frame), NOTHING)
         distances = [cv2.distanceTransform((carried != k).astype(np.uint8), cv2.DIST_L2, 5) for k in candidates]
         nearest = np.argmin(distances, axis=0)
         near = [(region & (nearest == k)).astype(np.float32) for k in range(len(candidates))]

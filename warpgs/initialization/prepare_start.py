@@ -7,7 +7,7 @@ import torch
 from warpgs.config import Plan, TrainConfig
 from warpgs.data.capture import Capture
 from warpgs.data.depth_alignment import typical_error
-from warpgs.data.dynamic_regions import dynamic_counts, unknown_depth
+from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.empty_masks import wrongly_empty
 from warpgs.data.responses import camera_responses
 from warpgs.errors import command, counted
@@ -127,7 +127,7 @@ def _can_distrust_masks(start: Start) -> bool:
 def _distrust_masks(start: Start) -> Start:
     """Trusts no masks that are wrongly empty; ``warpgs check`` and the warnings of training name them."""
     names, views = start.capture.train, start.views
-    masks = {name: dynamic_counts(view.static_mask.cpu(), view.camera) for name, view in zip(names, views, strict=True)}
+    masks = {name: glance.counts for name, glance in zip(names, views.glances, strict=True)}
     for name in wrongly_empty(start.capture.cameras, masks):
         views.mask_trust[names.index(name)] = 0.0
     return start

@@ -55,12 +55,11 @@ def see_objects(capture: Capture, views: Views, objects: Sequence[MovingObject])
 
 def _static_points(capture: Capture, views: Views, index: int) -> Points:
     """Rows and columns in the scaled mask, and depths, of the static points that a training frame shows."""
-    frame = views.frame(index)
-    assert frame.static_mask is not None
-    row, column, depth, inside = frame.camera.project(capture.points[:: -(-len(capture.points) // MAX_POINTS) or 1])
-    shown = inside & frame.static_mask[row, column]
-    width, height = scaled_size(frame.camera)
-    row, column = row[shown] * height // frame.camera.height, column[shown] * width // frame.camera.width
+    camera = views.camera(index)
+    row, column, depth, inside = camera.project(capture.points[:: -(-len(capture.points) // MAX_POINTS) or 1])
+    shown = inside & views.glances[index].static_mask[row, column]
+    width, height = scaled_size(camera)
+    row, column = row[shown] * height // camera.height, column[shown] * width // camera.width
     return row.int(), column.int(), depth[shown]
 
 

@@ -10,6 +10,9 @@ from warpgs.data.capture import MASKS_REMEDY, Capture
 from .pixels import Pixels, mask_border
 from .view_cache import ViewCache
 
+Change = Callable[[Tensor, Tensor], Tensor]
+"""A new inverse depth, from the old one and the static mask, both [H, W]."""
+
 
 class ViewReader:
     """Reads training views from a capture into host memory.
@@ -25,7 +28,8 @@ class ViewReader:
 
     def __init__(self, capture: Capture, mask_margin: float, pinned: bool) -> None:
         self._capture, self._mask_margin, self._pinned = capture, mask_margin, pinned
-        self._changed_depth: dict[int, Tensor] = {}  # of views for which the disk has no space
+        self._changed_depth: dict[int, tuple[Tensor, int]] = {}  # of views for which the disk has no space
+        self._later: dict[int, list[Change]] = {}
         self.cache: ViewCache | None = None
 
     def read(self, index: int) -> Pixels:
@@ -34,28 +38,40 @@ class ViewReader:
         Raises:
             ValueError: If the frame is damaged or has no mask; the message names it.
         """
-        pixels = self._pixels(index)
+        pixels, _ = self._pixels(index)
         return pixels.map(Tensor.pin_memory) if self._pinned else pixels
 
-    def change_depth(self, index: int, change: Callable[[Tensor, Tensor], Tensor]) -> None:
+    def read_once(self, index: int, keep: bool) -> Pixels:
+        """As ``read``, into memory that is not pinned; ``keep``: whether to store it in the cache."""
+        return self._pixels(index, pinned=False, keep=keep)[0]
+
+    def change_depth_later(self, index: int, change: Change) -> None:
+        """As ``change_depth``, once, when the view is read next: by a thread, while others do something else."""
+        self._later[index] = [*self._later.get(index, []), change]
+
+    def change_depth(self, index: int, change: Change) -> None:
         """Replaces the inverse depth of a view by a function of it and of the mask, in the cache if that has space.
 
         Called by one thread at a time. Others may read meanwhile: what they begin to read afterwards has the new depth.
         """
-        pixels = self._pixels(index)
-        depth = change(pixels.inverse_depth.float(), pixels.static_mask).half()
-        self._changed_depth[index] = depth
-        if self.cache and self.cache.store(index, pixels._replace(inverse_depth=depth), replace=True):
+        pixels, version = self._pixels(index, keep=False)
+        pixels = _with_depth(pixels, change)
+        self._changed_depth[index] = pixels.inverse_depth, version
+        if self.cache and self.cache.store(index, pixels, version, replace=True):
             del self._changed_depth[index]
 
-    def _pixels(self, index: int) -> Pixels:
-        pixels = self.cache.load(index, self._pinned) if self.cache else None
-        if pixels is None:
-            pixels = self._decoded(index)
-            if self.cache:
-                self.cache.store(index, pixels)
-        depth = self._changed_depth.get(index)
-        return pixels if depth is None else pixels._replace(inverse_depth=depth)
+    def _pixels(self, index: int, pinned: bool | None = None, keep: bool = True) -> tuple[Pixels, int]:
+        """The pixels of a view, and how many changes of ``change_depth_later`` they have."""
+        pinned, later = self._pinned if pinned is None else pinned, self._later.get(index, [])
+        stored = self.cache.load(index, pinned) if self.cache else None
+        pixels, version = (self._decoded(index), 0) if stored is None else stored
+        if (changed := self._changed_depth.get(index)) is not None and changed[1] >= version:
+            pixels, version = pixels._replace(inverse_depth=changed[0]), changed[1]
+        for change in later[version:]:
+            pixels = _with_depth(pixels, change)
+        if self.cache and keep and (stored is None or version < len(later)):
+            self.cache.store(index, pixels, len(later))
+        return pixels, len(later)
 
     def _decoded(self, index: int) -> Pixels:
         frame = self._capture.frame(self._capture.train[index])
@@ -70,6 +86,11 @@ class ViewReader:
         is_exact = frame.empty is not None and self._capture.assumption == "dynamic"
         border = mask_border(frame.static_mask, 0 if is_exact else margin) if margin else None
         return Pixels(frame.image, frame.static_mask, depth.half(), border)
+
+
+def _with_depth(pixels: Pixels, change: Change) -> Pixels:
+    depth = change(pixels.inverse_depth.float(), pixels.static_mask).half()
+    return pixels._replace(inverse_depth=depth)
 
 
 class Slot:

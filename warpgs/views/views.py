@@ -5,22 +5,29 @@ from functools import cached_property, partial
 from itertools import chain
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from warpgs.cache import cache_folder
 from warpgs.cameras import Camera
+from warpgs.command_line.progress import progress
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import resize_inverse
+from warpgs.data.sampling import evenly_spaced
 from warpgs.model.poses import PoseCorrections
 from warpgs.runtime.graphs import GraphCache
 
+from .glance import Glance, glance_at
 from .pixels import BYTES_PER_PIXEL, Pixels
 from .stacked_cameras import LensRays, StackedCameras
 from .view_cache import ViewCache
 from .view_reader import Slot, ViewReader
+
+MANY, SAMPLED = 1_000, 500
+"""Number of views above which steps that look at all of them look at some, and at how many of them."""
 
 
 class View(NamedTuple):
@@ -97,8 +104,8 @@ class Views:
         self._gains: Float[Tensor, "T 3"] | None = None
         self._reader = ViewReader(capture, mask_margin, pinned=device.type == "cuda")
         # New threads would use the first GPU, whatever the rank.
-        setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
-        self._read_ahead, self._slot = ReadAhead(self._reader.read, setup), Slot(device)
+        self._setup = partial(torch.cuda.set_device, torch.cuda.current_device()) if device.type == "cuda" else None
+        self._read_ahead, self._slot = ReadAhead(self._reader.read, self._setup), Slot(device)
         self.index, self._number = torch.zeros(1, dtype=torch.int64, device=device), 0
         self.mask_trust = torch.ones(len(capture.train), dtype=torch.float32, device=device)
         sizes = [camera.size for camera in cameras]
@@ -144,15 +151,37 @@ class Views:
 
     @torch.no_grad()
     def map(self, work: Callable[[View], tuple[Tensor, ...]]) -> Iterator[tuple[Tensor, ...]]:
-        """The results of work on every view, without gradients; each is valid until the next.
+        """The results of work on every view of the ``sample``, without gradients; each is valid until the next.
 
         Args:
             work: Returns tensors, and has no other effect: it may be captured in a CUDA graph.
         """
         graphs: GraphCache[str] | None = GraphCache(max_graphs=1, repeatable=True) if self.uses_graphs else None
-        for index in self._announced(range(len(self))):
+        for index in self._announced(self.sample):
             self.select(index)
             yield graphs.run("view", lambda: work(self.selected())) if graphs else work(self.selected())
+
+    @cached_property
+    def glances(self) -> list[Glance]:
+        """Each view at a glance: all frames are read once, by threads."""
+        indices = progress(range(len(self)), "looking at the views", quiet=len(self) <= MANY)
+        glances = ReadAhead(self._glance, self._setup).each(range(len(self)))
+        return [glance for _, glance in zip(indices, glances, strict=True)]
+
+    def _glance(self, index: int) -> Glance:
+        # A large file is written while training runs, and not before it.
+        if self.resident:
+            pixels = self._at(index).map(Tensor.cpu)
+        else:
+            pixels = self._reader.read_once(index, keep=len(self) <= MANY)
+        return glance_at(pixels, self.camera(index))
+
+    @cached_property
+    def sample(self) -> Sequence[int]:
+        """The indices of all views, or of ``SAMPLED`` of more than ``MANY``: spread over cameras and times."""
+        if len(self) <= MANY:
+            return range(len(self))
+        return sorted(evenly_spaced([index for video in self.videos for index in video], SAMPLED))
 
     @property
     def videos(self) -> list[list[int]]:
@@ -167,10 +196,15 @@ class Views:
     def frame(self, index: int) -> Frame:
         """The frame of an index, as ``frames`` gives it."""
         pixels = self._pixels(index)
-        return Frame(self._capture.train[index], self._camera(index), pixels.image.cpu(), pixels.static_mask.cpu())
+        return Frame(self._capture.train[index], self.camera(index), pixels.image.cpu(), pixels.static_mask.cpu())
 
-    def _camera(self, index: int) -> Camera:
+    def camera(self, index: int) -> Camera:
+        """The camera of a view as the capture has it, on the CPU."""
         return self._capture.cameras[self._capture.train[index]]
+
+    def time(self, index: int) -> Float[Tensor, "1"]:
+        """[1] time of a view in [0, 1], on the device."""
+        return self._times[index]
 
     def announce(self, indices: Iterable[int]) -> None:
         """Says which views come next, so that those that are not resident are read ahead."""
@@ -211,12 +245,21 @@ class Views:
         """
         scale, offset = alignment.cpu()
         inverse = ((1.0 / depths - offset) / scale).numpy()
+        is_known = np.isfinite(inverse)
+        # Kept until the view is read: only what is known.
+        values, known, shape = inverse[is_known], np.packbits(is_known), inverse.shape
 
         def change(depth: Tensor, static_mask: Tensor) -> Tensor:
-            found = resize_inverse(inverse, (depth.shape[1], depth.shape[0]))
+            small = np.full(shape, np.nan, np.float32)
+            small[np.unpackbits(known, count=small.size).view(bool).reshape(shape)] = values
+            found = resize_inverse(small, (depth.shape[1], depth.shape[0]))
             return torch.where(depth.isnan() & ~static_mask, torch.from_numpy(found), depth)
 
-        self.change_depth(index, change)
+        if self.resident:
+            self.change_depth(index, change)
+        else:
+            self._reader.change_depth_later(index, change)
+            self._read_ahead.discard(index)
 
     def change_depth(self, index: int, change: Callable[[Tensor, Tensor], Tensor]) -> None:
         """Replaces the inverse depth of a view by a function of it and of its static mask, on the CPU."""
@@ -234,9 +277,9 @@ class Views:
 
     @torch.no_grad()
     def cameras(self) -> list[Camera]:
-        """The corrected cameras of all views, on the device."""
-        cameras = [self._capture.cameras[name].to(self.device) for name in self._capture.train]
-        indices = torch.arange(len(self), device=self.device).split(1)
+        """The corrected cameras of the views of the ``sample``, on the device."""
+        cameras = [self.camera(index).to(self.device) for index in self.sample]
+        indices = torch.tensor(self.sample, device=self.device).split(1)
         return [self._corrected(*pair) for pair in zip(cameras, indices, strict=True)]
 
     def lens_rays(self) -> LensRays | None:

@@ -208,8 +208,8 @@ def test_a_run_ends_when_lost_dynamic_gaussians_cannot_be_added_again(trainer):
 @pytest.mark.parametrize("is_needed", [False, True])
 def test_a_branch_that_hardly_any_pixel_needs_may_lose_its_last_gaussian(trainer, is_needed):
     static = torch.tensor(9_989 if is_needed else 9_991)
-    views = Mock(spec=trainer.views, num_pixels=10_000)
-    views.map.side_effect = lambda _: iter([(static,)])
+    views = Mock(spec=trainer.views)
+    views.map.side_effect = lambda _: iter([(static, 10_000 - static)])
     before, trainer.scene.dynamic = (len(trainer.scene.static), 7), Gaussians.empty(0, 1)
     if is_needed:
         with pytest.raises(ValueError, match=r"but 0\.1% of the training pixels are dynamic"):

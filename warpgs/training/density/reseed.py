@@ -58,8 +58,9 @@ def require_branches(before: tuple[int, int], scene: SplitScene, views: Views, c
     if not lost:
         return None
     branch, other = lost[0], "dynamic" if lost[0] == "static" else "static"
-    num_static = sum(int(count) for (count,) in views.map(lambda view: (view.static_mask.sum(),)))
-    share = (num_static if branch == "static" else views.num_pixels - num_static) / views.num_pixels
+    counts = views.map(lambda view: (view.static_mask.sum(), (~view.static_mask).sum()))
+    num_static, num_dynamic = (sum(numbers) for numbers in zip(*([*map(int, pair)] for pair in counts), strict=True))
+    share = (num_static if branch == "static" else num_dynamic) / (num_static + num_dynamic)
     removed = f"the last {branch} Gaussian was removed, as transparent, oversized or rarely seen"
     if share < MIN_REGION:
         return f"{removed}; {share:.2%} of the training pixels are {branch}"
@@ -115,7 +116,7 @@ def gaussians_that_show(
     canonical, kept = torch.empty_like(found.positions), torch.zeros(len(found.positions), dtype=torch.bool)
     for index in found.views.unique().tolist():
         chosen = found.views == index
-        seen, time = found.positions[chosen].to(views.device), views[index].time
+        seen, time = found.positions[chosen].to(views.device), views.time(index)
         x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * view_size)
         canonical[chosen], kept[chosen] = x.cpu(), reached.cpu()
     return gaussians_at(canonical[kept], found.colors[kept], config.model.sh_degree, MAX_SCALE * view_size)
