@@ -23,6 +23,15 @@ def test_every_command_says_the_version(command, capsys):
     assert second.startswith("cpu: kernels for it are ") or second.startswith("cuda (")
 
 
+def test_the_version_is_said_although_a_package_is_missing(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "warpgs.runtime.machine", None)
+    assert main(["--version"]) == 2
+    said = capsys.readouterr()
+    assert said.out == f"warpgs {importlib.metadata.version('warpgs')}\n"
+    assert said.err.startswith("warpgs: import of warpgs.runtime.machine halted")
+    assert said.err.count("\n") == 1
+
+
 def shown(capsys, *arguments):
     with pytest.raises(SystemExit) as end:
         main(list(arguments))

@@ -90,13 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(wrapped(usage()))
         return 0
     if name == "--version" or rest == ["--version"]:
-        print(f"warpgs {version()}", flush=True)
-        with ending_at_once():
-            from .runtime.devices import choose_device
-            from .runtime.machine import described, kernels_note
-        device = choose_device()
-        print(f"{described(device)}: {kernels_note(device)}")
-        return 0
+        print(f"warpgs {version()}", flush=True)  # first: the rest imports what may be missing or broken
+        return run_command(_describe_machine)
     if name.startswith("--tyro"):
         return _print_completion(arguments)
     if name not in COMMANDS:
@@ -105,6 +100,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILED
     prog = f"warpgs {name}"
     return train(rest, prog) if name == "train" else run_command(lambda: _run(name, rest, prog), prog)
+
+
+def _describe_machine() -> None:
+    """Says what kernels run on, and whether they are compiled for it."""
+    with ending_at_once():
+        from .runtime.devices import choose_device
+        from .runtime.machine import described, kernels_note
+    device = choose_device()
+    print(f"{described(device)}: {kernels_note(device)}")
 
 
 def _run(name: str, arguments: Sequence[str], prog: str) -> object:
