@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -69,13 +68,30 @@ def test_a_command_starts_in_a_process_of_its_own(tmp_path, monkeypatch, capfd):
     assert "warpgs prepare: " in capfd.readouterr().err
 
 
-ENDS_SLOWLY = """
+WAITS = """
+import signal, subprocess, sys
+from warpgs import demo
+
+class Told(subprocess.Popen):
+    def wait(self, timeout=None):
+        print("waits", flush=True)
+        return super().wait(timeout)
+
+subprocess.Popen = Told
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which shells turn off for what runs in the background
+sys.exit(demo._run([sys.executable, "-c", sys.argv[1]]))
+"""
+
+ENDS_WHEN_TOLD = """
 import signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
 try:
-    print("ready", flush=True)
-    time.sleep(60)
+    print("works", flush=True)
+    while True:
+        time.sleep(0.01)
 except KeyboardInterrupt:
-    time.sleep(1)
+    print("saves", flush=True)
+    sys.stdin.readline()
     print("saved", flush=True)
     sys.exit(130)
 """
@@ -83,10 +99,11 @@ except KeyboardInterrupt:
 
 def test_an_interrupted_command_may_end_by_itself():
     """Ctrl-C reaches both processes."""
-    wait = f"import sys; from warpgs import demo; sys.exit(demo._run([sys.executable, '-c', {ENDS_SLOWLY!r}]))"
-    process = subprocess.Popen([sys.executable, "-c", wait], stdout=subprocess.PIPE, start_new_session=True, text=True)
-    assert process.stdout.readline() == "ready\n"
-    time.sleep(0.2)
-    os.killpg(process.pid, signal.SIGINT)
-    assert process.communicate(timeout=30)[0] == "saved\n"
+    command = [sys.executable, "-c", WAITS, ENDS_WHEN_TOLD]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes, start_new_session=True) as process:
+        assert {process.stdout.readline(), process.stdout.readline()} == {"waits\n", "works\n"}
+        os.killpg(process.pid, signal.SIGINT)
+        assert {process.stdout.readline(), process.stdout.readline()} == {"waits\n", "saves\n"}
+        assert process.communicate("\n")[0].startswith("saved\n")
     assert process.returncode == 130
