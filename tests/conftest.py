@@ -21,6 +21,12 @@ def pytest_addoption(parser):
     parser.addoption("--cluster", action="store_true", help="also run tests that kill nodes of a Ray cluster (minutes)")
 
 
+def pytest_configure(config):
+    """Files in their order: with those of few tests last, a single long one would keep one of two workers busy."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)

@@ -54,19 +54,19 @@ def test_a_stream_that_does_not_know_whether_it_is_a_terminal_gets_whole_lines()
     assert tee.written == "word " * 100 + "end\n"
 
 
-@pytest.mark.parametrize("columns", [60, 80])
 @pytest.mark.parametrize(
-    ("code", "words"),
+    ("columns", "code", "words"),
     [
-        ("from warpgs.cli import main; main(['train', '--data', 'nerfds/as'])", "CAPTURE (your own video)"),
-        ("from warpgs.cli import main; main(['train', '--preset', 'nosuch'])", "got 'nosuch'"),
+        (60, "from warpgs.cli import main; main(['train', '--data', 'nerfds/as'])", "CAPTURE (your own video)"),
+        (80, "from warpgs.cli import main; main(['train', '--preset', 'nosuch'])", "got 'nosuch'"),
         (
+            60,
             "from warpgs.runs.logger import TrainingLogger; TrainingLogger(None, 9, 0).log('long ' * 30 + 'END')",
             "END",
         ),
     ],
 )
-def test_messages_on_a_terminal_break_between_words(code, words, columns):
+def test_messages_on_a_terminal_break_between_words(columns, code, words):
     with Terminal(code, columns=columns) as terminal:
         shown = terminal.read_until(words.split()[-1])
     lines = shown.split("\n")

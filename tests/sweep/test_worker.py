@@ -37,24 +37,13 @@ def replace_child(monkeypatch, program):
     monkeypatch.setattr(worker.subprocess, "Popen", start)
 
 
-def cut_off(path):
-    path.write_bytes(path.read_bytes()[:100])
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda capture: capture.rename(capture.with_name("elsewhere")), " does not exist"),
-        (lambda capture: (capture / "dataset.json").write_text("{"), "/dataset.json is not valid JSON: "),
-        (lambda capture: cut_off(capture / "rgb/1x/left_000003.png"), "/rgb/1x/left_000003.png is truncated: "),
-    ],
-)
-def test_a_broken_capture_is_one_line(tmp_path, damage, message):
+def test_a_broken_capture_is_one_line(tmp_path):
     capture = tiny.write(tmp_path)
-    damage(capture)
+    path = capture / "rgb/1x/left_000003.png"
+    path.write_bytes(path.read_bytes()[:100])
     error = run_job(job(tmp_path, "--preset", "quick", "--data", str(capture), "--out", str(tmp_path / "cell")))
     assert error is not None
-    assert error.startswith(f"{HOST}: warpgs train: {capture}{message}")
+    assert error.startswith(f"{HOST}: warpgs train: {path} is truncated: ")
     assert "\n" not in error
     assert not (tmp_path / "running/cell").exists()
     assert not (tmp_path / "cell").exists()
