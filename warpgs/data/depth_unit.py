@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .capture import Frame
@@ -111,7 +111,7 @@ def _agreement(
     with np.errstate(invalid="ignore"):
         agrees = inside & (np.abs(depth / (factors[:, None] * depths[1][row, column]) - 1.0) < TOLERANCE)
     a, b = _grey(first)[rows, columns], _grey(second)[row, column]
-    return np.array([_correlation(a[k], c[k]) * k.mean() for k, c in zip(agrees, b, strict=True)])
+    return _correlations(a, b, agrees) * agrees.mean(1)
 
 
 def _line_of_sight(
@@ -132,8 +132,14 @@ def _grey(frame: Frame) -> Float[np.ndarray, "H W"]:
     return cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY).astype(np.float64)
 
 
-def _correlation(a: Float[np.ndarray, " N"], b: Float[np.ndarray, " N"]) -> float:
-    """Correlation of two samples, at least 0; 0 if they are few or without contrast."""
-    if len(a) < MIN_PIXELS or a.std() < 1.0 or b.std() < 1.0:
-        return 0.0
-    return max(0.0, float(np.corrcoef(a, b)[0, 1]))
+def _correlations(
+    a: Float[np.ndarray, " N"], b: Float[np.ndarray, "S N"], chosen: Bool[np.ndarray, "S N"]
+) -> Float[np.ndarray, " S"]:
+    """Correlations of the chosen samples of a and b, at least 0; 0 if they are few or without contrast."""
+    count, of_b = np.maximum(chosen.sum(1), 1), np.where(chosen, b, 0.0)
+    mean_a, mean_b = chosen @ a / count, of_b.sum(1) / count
+    variance_a = chosen @ a**2 / count - mean_a**2
+    variance_b = (of_b**2).sum(1) / count - mean_b**2
+    is_usable = (chosen.sum(1) >= MIN_PIXELS) & (variance_a >= 1.0) & (variance_b >= 1.0)
+    scale = np.sqrt(np.where(is_usable, variance_a * variance_b, 1.0))
+    return np.where(is_usable, np.maximum(0.0, (of_b @ a / count - mean_a * mean_b) / scale), 0.0)
