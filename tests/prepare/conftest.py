@@ -10,6 +10,12 @@ def video():
     return boards.record(24)
 
 
+@pytest.fixture
+def no_comparison(monkeypatch):
+    """Preparations do not compare their frames, which makes doubts known: it takes most of the time of small ones."""
+    monkeypatch.setattr("warpgs.prepare.steps.doubts_of_motion", lambda *_: [])
+
+
 @pytest.fixture(scope="module")
 def frames(video):
     return boards.posed(video[0])

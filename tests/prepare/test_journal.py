@@ -31,7 +31,7 @@ def masks(tmp_path_factory, shots):
 
 
 @pytest.fixture
-def true_cameras(monkeypatch):
+def true_cameras(monkeypatch, no_comparison):
     monkeypatch.setattr(steps, "recover_cameras", boards.true_cameras)
 
 

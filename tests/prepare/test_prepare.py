@@ -226,7 +226,7 @@ def test_other_options_require_force(made, shots):
         prepare(shots, made, holdout=8, selection=Selection(count=5))
 
 
-def test_an_interrupted_preparation_continues_after_the_last_finished_step(shots, tmp_path, monkeypatch):
+def test_an_interrupted_preparation_continues_after_the_last_finished_step(shots, tmp_path, monkeypatch, no_comparison):
     interrupt_before_the_capture_is_written(shots, tmp_path / "made", monkeypatch)
     for finished in ("take_frames", "recover_cameras"):
         monkeypatch.setattr(f"warpgs.prepare.steps.{finished}", lambda *arguments: pytest.fail("finished before"))
@@ -285,7 +285,7 @@ def test_a_frame_without_a_camera_is_noted_and_omitted(tmp_path):
     assert "frame_000006" not in capture.cameras
 
 
-def test_known_intrinsics_are_those_of_the_capture(shots, tmp_path, monkeypatch):
+def test_known_intrinsics_are_those_of_the_capture(shots, tmp_path, monkeypatch, no_comparison):
     """The file has the intrinsics of frames twice as large."""
 
     def recover(folder, names, work, settings, quiet):
@@ -299,7 +299,7 @@ def test_known_intrinsics_are_those_of_the_capture(shots, tmp_path, monkeypatch)
     assert K[:2].tolist() == [[230.0, 0.0, 130.0], [0.0, 230.0, 96.0]]
 
 
-def test_given_masks_are_used_unchanged(shots, tmp_path):
+def test_given_masks_are_used_unchanged(shots, tmp_path, no_comparison):
     (tmp_path / "masks").mkdir()
     for k, mask in enumerate(boards.record(24)[1]):
         cv2.imwrite(str(tmp_path / f"masks/shot{k:03d}.png"), np.where(mask, 0, 255).astype(np.uint8))
@@ -313,7 +313,7 @@ def test_given_masks_are_used_unchanged(shots, tmp_path):
 @pytest.mark.parametrize("ending", [".png", ".png.png"])
 @pytest.mark.parametrize("pattern", ["shot{:03d}", "frame_{:06d}"])
 def test_given_masks_and_frames_stay_as_they_are_with_the_lens_that_was_found(
-    ending, pattern, shots, tmp_path, monkeypatch
+    ending, pattern, tmp_path, monkeypatch, no_comparison
 ):
     distorted = dataclasses.replace(boards.lens(), coefficients=(-0.2,))
 
@@ -321,14 +321,14 @@ def test_given_masks_and_frames_stay_as_they_are_with_the_lens_that_was_found(
         return dataclasses.replace(boards.true_cameras(folder, names), lens=distorted)
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
-    mask = boards.record(24)[1][10]
+    shots, mask = boards.write_folder(tmp_path / "shots", boards.record(24)[0][:8]), boards.record(24)[1][6]
     (tmp_path / "masks").mkdir()
-    for k in range(24):
+    for k in range(8):
         cv2.imwrite(str(tmp_path / "masks" / (pattern.format(k) + ending)), np.where(mask, 0, 255).astype(np.uint8))
     prepare(shots, tmp_path / "made", masks=str(tmp_path / "masks"), depth="none")
-    frame = load_capture(tmp_path / "made").frame("frame_000010")
+    frame = load_capture(tmp_path / "made").frame("frame_000006")
     assert np.array_equal(~frame.static_mask.numpy(), mask)
-    assert np.array_equal(frame.image.numpy(), cv2.imread(str(sorted(shots.iterdir())[10]))[..., ::-1])
+    assert np.array_equal(frame.image.numpy(), cv2.imread(str(sorted(shots.iterdir())[6]))[..., ::-1])
     assert Lens.of(frame.camera).coefficients == pytest.approx((-0.2,))
 
 
@@ -530,7 +530,9 @@ def test_colmap_does_not_start_on_a_full_disk(shots, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("error", [NoCamerasError("few features"), ValueError("COLMAP failed")])
-def test_cameras_of_the_first_pass_are_kept_if_masks_leave_too_little(error, shots, tmp_path, monkeypatch):
+def test_cameras_of_the_first_pass_are_kept_if_masks_leave_too_little(
+    error, shots, tmp_path, monkeypatch, no_comparison
+):
     def recover(folder, names, work, settings, quiet):
         if settings.masks is not None:
             raise error
@@ -538,6 +540,7 @@ def test_cameras_of_the_first_pass_are_kept_if_masks_leave_too_little(error, sho
 
     monkeypatch.setattr("warpgs.prepare.steps.recover_cameras", recover)
     monkeypatch.setattr("warpgs.prepare.masks.still.find_dynamic", lambda f, *rest: [i[..., 0] > 255 for i in f.images])
+    monkeypatch.setattr("warpgs.prepare.masks.masker.WORKING_SIDE", boards.SIZE[0])
     if isinstance(error, NoCamerasError):
         notes = prepare(shots, tmp_path / "made", depth="none")["notes"]
         assert (
