@@ -33,6 +33,10 @@ FISHEYE, FISHEYE_FOCAL = "OPENCV_FISHEYE", 0.5
 CHUNK = 16
 """Number of frames whose features are extracted, or that are matched with others, between two reports."""
 
+SEED = 0
+"""Seed of everything that COLMAP draws. Without one of its own, what each of several threads draws depends on what it
+did before, so on the order in which pairs of frames were taken."""
+
 Report = Callable[[str, int, int], None]
 
 
@@ -135,6 +139,7 @@ def extract_and_match(job: Job, report: Report) -> None:
     finished.unlink(missing_ok=True)
     for end in ("", "-wal", "-shm"):  # a new database cannot be made next to the log of another one
         Path(f"{job.database}{end}").unlink(missing_ok=True)
+    pycolmap.Database.open(job.database).close()
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = MAX_FEATURES
     extraction.sift.max_num_orientations = 1
@@ -148,7 +153,11 @@ def extract_and_match(job: Job, report: Report) -> None:
 
 
 def _extract(job: Job, camera: int, files: list[str], extraction: Any, report: Report) -> None:
-    """Features of the images of a camera, which is the ``camera``-th in the database, from 1 on."""
+    """Features of the images of a camera, which is the ``camera``-th in the database, from 1 on.
+
+    Images get their numbers before: extraction would number them as its threads finish, in another order every time,
+    and matches depend on which image of a pair is the first.
+    """
     reading, single = pycolmap.ImageReaderOptions(), pycolmap.CameraMode.SINGLE
     reading.camera_model = job.lens
     if (params := _starting_parameters(job, files[0])) is not None:
@@ -159,6 +168,7 @@ def _extract(job: Job, camera: int, files: list[str], extraction: Any, report: R
     for start in range(0, len(files), CHUNK):
         report("features", job.files.index(files[start]), len(job.files))
         chunk = files[start : start + CHUNK]
+        pycolmap.import_images(job.database, job.folder, single, chunk, reading)
         pycolmap.extract_features(job.database, job.folder, chunk, single, reading, extraction, pycolmap.Device.cpu)
         reading.existing_camera_id = camera
 
@@ -179,12 +189,14 @@ def match(job: Job, pairs: Sequence[tuple[int, int]], report: Report) -> None:
     options.match_list_path = listed
     matching = pycolmap.FeatureMatchingOptions()
     matching.guided_matching = job.stands_still
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
     step = max(1, len(pairs) * CHUNK // max(len(job.names), 1))
     for start in range(0, len(pairs), step):
         report("matches", start, len(pairs))
         lines = [f"{job.files[a]} {job.files[b]}\n" for a, b in pairs[start : start + step]]
         listed.write_text("".join(lines), "utf-8")
-        pycolmap.match_image_pairs(job.database, matching, options, device=pycolmap.Device.cpu)
+        pycolmap.match_image_pairs(job.database, matching, options, verification, pycolmap.Device.cpu)
 
 
 def static_database(job: Job) -> Path:

@@ -13,7 +13,7 @@ import pycolmap
 
 from warpgs.data.colmap import PANORAMA
 
-from .features import Job, Report, match, static_database
+from .features import SEED, Job, Report, match, static_database
 from .focal_guess import calibrated, confirms, focal_of, is_plausible, read_focals
 from .matches import all_pairs, revisit_pairs
 
@@ -106,6 +106,7 @@ def _size(model: Any) -> int:
 def _pipeline_options(job: Job) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
+    options.random_seed = SEED
     options.ba_refine_focal_length = job.finds_focal
     options.ba_refine_extra_params = job.params is None
     if job.stands_still:
@@ -129,6 +130,7 @@ def _map_globally(job: Job, database: Path, report: Report) -> Any:
 def _map_from(job: Job, database: Path) -> Any:
     """The reconstruction by global mapping that starts from the database's focal length."""
     options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = SEED
     options.mapper.track_required_tracks_per_view = GLOBAL_TRACKS
     options.mapper.ba_skip_fixed_rotation_stage = True  # saves a stage; camera centres as before
     _set_adjustment(options.mapper.bundle_adjustment, job)
