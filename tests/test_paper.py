@@ -30,6 +30,7 @@ PAPER = {
     },
     "Visual Geometry Decomposition: Eq. 10 to 12, dynamic component": {
         "model.deformation": "mlp",
+        "model.segments": 1,
         "loss.mask_margin": 0.0,
         "assume": "masks",
     },

@@ -57,16 +57,23 @@ def test_replayed_steps_change_parameters_as_eager_steps_do(data, tmp_path, resi
     data = shutil.copytree(data, tmp_path / "capture")
     for path in (data / "camera").iterdir():
         edit_json(path, **fields)
-    eager, again = (
-        parameters_after_steps(data, tmp_path / f"eager{k}", graph=False, background=background) for k in range(2)
-    )
-    changes = {"graph": True, "resident_bytes": resident_bytes, "background": background}
-    replayed = parameters_after_steps(data, tmp_path / "replayed", **changes)
+    replayed = require_equal_steps(data, tmp_path, {"resident_bytes": resident_bytes}, background=background)
     assert ("dome.texels" in replayed) == (background == "sky")
+
+
+def test_replayed_steps_of_several_segments_change_parameters_as_eager_steps_do(data, tmp_path):
+    require_equal_steps(data, tmp_path, {}, model=dataclasses.replace(tiny.MODEL, segments=2))
+
+
+def require_equal_steps(data, tmp_path, of_replayed, **changes):
+    """Compares parameters after steps; returns those after replayed ones."""
+    eager, again = (parameters_after_steps(data, tmp_path / f"eager{k}", graph=False, **changes) for k in range(2))
+    replayed = parameters_after_steps(data, tmp_path / "replayed", graph=True, **of_replayed, **changes)
     for name, expected in eager.items():
         if expected.any():
             noise = relative_error(again[name], expected)
             assert relative_error(replayed[name], expected) < max(1e-3, 4.0 * noise), name
+    return replayed
 
 
 @pytest.mark.parametrize("strategy", DENSITY)

@@ -33,6 +33,10 @@ class ModelConfig:
     """Hidden layer after which the encoding is concatenated again (5 in Deformable-3DGS), unless it is the last one."""
     deformation: str = "mlp"
     """Deformation model, a key of FIELDS in warpgs/model/fields.py; "splines" takes the place of "mlp" on tracks."""
+    segments: Annotated[int | None, Bounds(min=1, max=256)] = None
+    """Number of segments of time, each with dynamic Gaussians and a deformation network of its own; neighbours overlap
+    by a twentieth. One for every 600 times of training frames if omitted, so that a network has seconds to learn, not
+    minutes. The numbers of Gaussians and of steps to fit the deformation are those of each segment."""
     sh_degree: int = 3
     """Maximum degree of spherical harmonics."""
     appearance: Literal["color", "all"] = "color"

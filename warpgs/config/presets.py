@@ -28,6 +28,7 @@ PAPER = replace(
         skip=5,
         appearance="all",
         dynamic_points=100_000,
+        segments=1,
         dropout=0.0,
         tracks=False,
     ),

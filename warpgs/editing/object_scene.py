@@ -171,6 +171,9 @@ def number_of(objects: Objects, option: str, name: str) -> int:
 
 
 def _retimed(scene: TrainedScene, objects: Objects, edits: Edits) -> list[Retimed]:
+    if scene.scene.num_segments > 1 and edits.freeze + edits.shift:
+        option = "freeze" if edits.freeze else "shift"
+        raise ValueError(f"--{option}: this scene has {scene.scene.num_segments} segments of time, expected one")
     moving = {*objects.ids[len(scene.scene.static) :].tolist()}
     changes = []
     for option, times in (("freeze", edits.freeze), ("shift", edits.shift)):

@@ -1,9 +1,10 @@
 """A dynamic scene at several key times, quantised to integers: what a page plays.
 
 Static Gaussians have one geometry, and a colour and an opacity per key time; dynamic Gaussians have a geometry per key
-time and one colour. Both are stored as coefficients over the key times (``transform``), along a Morton curve, colours
-as luma and two chroma (YCoCg), in coarser steps for Gaussians that are hardly visible. Between key times, means,
-colours and logarithms of scales are interpolated linearly; rotations too, and are then normalised.
+time and one colour, but an opacity per key time where they have segments of time. Both are stored as coefficients over
+the key times (``transform``), along a Morton curve, colours as luma and two chroma (YCoCg), in coarser steps for
+Gaussians that are hardly visible. Between key times, means, colours and logarithms of scales are interpolated linearly;
+rotations too, and are then normalised.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -68,7 +69,7 @@ class Branch:
             quaternions with w ≥ 0.
         log_scales: [1 or K, N, 3].
         colors: [K or 1, N, 3] luma and chroma of the constant coefficient.
-        opacities: [K or 1, N, 1].
+        opacities: [K or 1, N, 1], as many times as ``colors`` has.
         rest: [R, N, 3] luma and chroma of the coefficients of degree 1 and higher, the same at all times.
     """
 
@@ -141,12 +142,13 @@ def bake(
         precision: All steps of quantisation are divided by it.
         weights: How visible each Gaussian is, in any unit (``contribution``); the same for all if None.
     """
-    static_colors, dynamic_geometry, finite = [], [], np.ones(1, bool)
+    static_colors, dynamic_colors, dynamic_geometry, finite = [], [], [], np.ones(1, bool)
     for time in times:
         cloud = cloud_at(time)
         finite = finite & cloud.finite
         is_dynamic = cloud.is_dynamic
         static_colors.append(_color(cloud.select(~is_dynamic)))
+        dynamic_colors.append(_color(cloud.select(is_dynamic)))
         dynamic_geometry.append([part[is_dynamic] for part in (cloud.means, cloud.quats, cloud.log_scales)])
     static, dynamic = cloud.select(~is_dynamic & finite), cloud.select(is_dynamic & finite)
     weights = np.ones(len(cloud), np.float32) if weights is None else weights
@@ -154,10 +156,12 @@ def bake(
     tracks = [np.stack(parts)[:, finite[is_dynamic]] for parts in zip(*dynamic_geometry, strict=True)]
     geometry = [part[None] for part in (static.means, static.quats, static.log_scales)]
     steps = [{name: pair[branch] / precision for name, pair in STEPS.items()} for branch in (0, 1)]
+    if all(np.array_equal(colors, dynamic_colors[0], equal_nan=True) for colors in dynamic_colors):
+        dynamic_colors = dynamic_colors[:1]
     return Baked(
         len(dynamic_geometry),
         _branch(geometry, np.stack(static_colors)[:, finite[~is_dynamic]], static.sh[:, 1:], octaves[0], steps[0]),
-        _branch(tracks, _color(dynamic)[None], dynamic.sh[:, 1:], octaves[1], steps[1]),
+        _branch(tracks, np.stack(dynamic_colors)[:, finite[is_dynamic]], dynamic.sh[:, 1:], octaves[1], steps[1]),
     )
 
 
@@ -174,10 +178,15 @@ def octaves_of(weights: Float32[np.ndarray, " N"]) -> Int32[np.ndarray, " N"]:
     return np.clip(np.rint(octaves - octaves.mean()), -MAX_OCTAVES, MAX_OCTAVES).astype(np.int32)
 
 
-def texture_bytes(num_static: int, num_dynamic: int, keys: int, rest: int) -> int:
-    """Memory of the player's textures for a page [bytes], with ``rest`` coefficients beyond degree 0."""
+def texture_bytes(num_static: int, num_dynamic: int, keys: int, rest: int, fades: bool = False) -> int:
+    """Memory of the player's textures for a page [bytes], with ``rest`` coefficients beyond degree 0.
+
+    ``fades`` says whether dynamic opacities change over time.
+    """
     geometry, color, rest = TEXEL["geometry"], TEXEL["colors"], TEXEL["rest"] * rest
-    return num_static * (geometry + keys * color + rest) + num_dynamic * (keys * geometry + color + rest)
+    return num_static * (geometry + keys * color + rest) + num_dynamic * (
+        keys * geometry + (keys if fades else 1) * color + rest
+    )
 
 
 def _color(cloud: Cloud) -> np.ndarray:

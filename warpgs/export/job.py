@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from warpgs.data.capture import Capture
 from warpgs.editing.edited_scene import with_edits
+from warpgs.model.segmented_deformation import SegmentedDeformation
 from warpgs.runs.run import Run
 from warpgs.runs.scene_file import SceneFile
 from warpgs.video import orientation
@@ -44,6 +45,8 @@ class Job:
             run.trained_scene(), run.folder, editing, lambda: self.capture, quiet, self.has_objects
         )
         self.notes += notes
+        if isinstance(scene.scene.deformation, SegmentedDeformation):
+            scene.scene.deformation.is_complete = True
         return Clouds(scene)
 
     @property

@@ -188,7 +188,8 @@ def _check_memory(job: Job, keys: int) -> None:
     cloud = job.clouds.at(0.0)
     num_static, num_dynamic = int((~cloud.is_dynamic).sum()), int(cloud.is_dynamic.sum())
     check_size({"static": num_static, "dynamic": num_dynamic}, keys)
-    size = texture_bytes(num_static, num_dynamic, keys, cloud.sh.shape[1] - 1)
+    fades = job.clouds.scene.scene.num_segments > 1
+    size = texture_bytes(num_static, num_dynamic, keys, cloud.sh.shape[1] - 1, fades)
     maximum = job.options.max_megabytes or MAX_MEGABYTES
     if size > maximum * 1e6:
         fitting = int(len(cloud) * maximum * 1e6 / size)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
-from torch import Tensor, nn
+from torch import Tensor
 
 from warpgs.config import TrainConfig
 from warpgs.data import depth_alignment
@@ -79,7 +79,7 @@ def is_depth_known(views: Views, alignments: Float[Tensor, "T 2"]) -> bool:
 
 @torch.no_grad()
 def to_canonical(
-    deformation: nn.Module,
+    deformation: Callable[[Tensor, Tensor], Tensor],
     seen: Float[Tensor, "P 3"],
     time: Float[Tensor, "1"],
     start: Float[Tensor, "P 3"],

@@ -8,6 +8,7 @@ import numpy as np
 from warpgs.config import Background, Color, ModelConfig, Plan, TrainConfig, scaled
 from warpgs.data.capture import COLORS, Capture, background_color
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.model.segments import OVERLAP, default_number
 from warpgs.runtime.devices import choose_device
 
 from .sky import find_sky
@@ -30,6 +31,11 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
     (background, found), loss = _background(config, capture), config.loss
     notes += found
     asked, num = config.model.time_bands, len(capture.moments)
+    segments = _num_segments(config.model, num)
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, segments=segments))
+    if segments > 1:
+        num = math.ceil(num * (1.0 + OVERLAP) / segments)
+        notes.append(f"{segments} segments of about {num} times have dynamic Gaussians and a deformation of their own")
     bands = determined_bands(config.model, num)
     if bands < asked:
         notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} times determine no more")
@@ -44,6 +50,15 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
         notes.append("the masks are estimates: stage II compares the image of all Gaussians only, not each branch's")
         branches = False
     return Plan.of(config, choose_device(config.device), background, branches), notes
+
+
+def _num_segments(model: ModelConfig, num_times: int) -> int:
+    """Number of segments: what is asked for, or what suits the number of times."""
+    if model.deformation == "mlp":
+        return default_number(num_times) if model.segments is None else model.segments
+    if model.segments not in (None, 1):
+        raise ValueError(f'model.segments {model.segments} needs model.deformation "mlp", got "{model.deformation}"')
+    return 1
 
 
 def _background(config: TrainConfig, capture: Capture) -> tuple[Background, list[str]]:

@@ -104,6 +104,8 @@ def _even_exposure(start: Start) -> Start:
 
 def _may_be_tracked(start: Start) -> bool:
     model = start.plan.model
+    if (model.segments or 1) > 1:
+        return False
     return not start.resumed and (model.deformation == "splines" or (model.tracks and model.deformation == "mlp"))
 
 

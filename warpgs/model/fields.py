@@ -10,6 +10,7 @@ from warpgs.config import ModelConfig
 from warpgs.errors import suggestion
 
 from .mlp_deformation import MlpDeformation
+from .segmented_deformation import SegmentedDeformation
 from .spline_deformation import SplineDeformation
 
 FIELDS: dict[str, type[nn.Module]] = {
@@ -27,7 +28,7 @@ device of ``center``.
 
 
 def make_deformation(config: ModelConfig, center: Float[Tensor, "3"], half_size: Float[Tensor, "3"]) -> nn.Module:
-    """The deformation model that ``config.deformation`` names.
+    """The deformation model that ``config.deformation`` names; with several segments, one network for each of them.
 
     Positions are in the box ``center`` ± ``half_size``, [3] each.
 
@@ -37,4 +38,6 @@ def make_deformation(config: ModelConfig, center: Float[Tensor, "3"], half_size:
     if config.deformation not in FIELDS:
         known = ", ".join(sorted(FIELDS)) + suggestion(config.deformation, FIELDS)
         raise ValueError(f"there is no deformation model {config.deformation!r}; model.deformation is one of: {known}")
+    if (config.segments or 1) > 1:
+        return SegmentedDeformation(config, center, half_size)
     return FIELDS[config.deformation](config, center, half_size)

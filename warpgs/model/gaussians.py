@@ -27,9 +27,11 @@ class Gaussians(nn.Module):
         sh_dc: [N, 1, 3] SH coefficients of degree 0.
         sh_rest: [N, 0 | 3 | 8 | 15, 3] SH coefficients of degrees 1 to 0 | 1 | 2 | 3.
         reflectances: [N, F] how they reflect light (``reflections``); None unless they do.
+        segments: [N] the segment of time in which they are there (``model.segments``); None if there is one alone.
     """
 
     reflectances: nn.Parameter | None
+    segments: Tensor | None
 
     def __init__(
         self,
@@ -48,6 +50,7 @@ class Gaussians(nn.Module):
         self.sh_dc = nn.Parameter(sh_dc)
         self.sh_rest = nn.Parameter(sh_rest)
         self.register_parameter("reflectances", None)
+        self.register_buffer("segments", None)
 
     @staticmethod
     def from_points(
@@ -104,6 +107,7 @@ class Gaussians(nn.Module):
             name: None if p is None else nn.Parameter(p.detach()[kept], p.requires_grad)
             for name, p in self._parameters.items()
         }
+        selected._buffers = {"segments": None if self.segments is None else self.segments[kept]}
         return selected
 
     @torch.no_grad()
@@ -115,6 +119,8 @@ class Gaussians(nn.Module):
         for parameter in self.parameters():
             parameter.data = parameter.data[parents]
             parameter.grad = None
+        if self.segments is not None:
+            self.segments = self.segments[parents]
 
     @torch.no_grad()
     def append(self, added: "Gaussians") -> None:
@@ -127,3 +133,6 @@ class Gaussians(nn.Module):
             new = parameter.new_zeros(len(added), *parameter.shape[1:]) if new is None else new.to(parameter.device)
             parameter.data = torch.cat([parameter.data, new])
             parameter.grad = None
+        if self.segments is not None:
+            assert added.segments is not None
+            self.segments = torch.cat([self.segments, added.segments.to(self.segments.device)])

@@ -2,6 +2,9 @@
 
 import copy
 import dataclasses
+import math
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -13,10 +16,12 @@ from warpgs.config import ModelConfig
 from warpgs.ops.activation import Changes, activate, join_sh
 from warpgs.runtime.streams import concurrently
 
+from . import segments
 from .dome import Dome
 from .fields import make_deformation
 from .gaussians import Gaussians
 from .reflections import Light, reflections
+from .segmented_deformation import SegmentedDeformation
 from .splats import Splats
 from .trunk import Trunk
 
@@ -29,7 +34,9 @@ class AppearanceField(nn.Module):
         changes_all = config.appearance == "all"
         self.bases = (config.sh_degree + 1) ** 2 if changes_all else 1
         depth, width = config.appearance_size or (config.depth, config.width)
-        config = dataclasses.replace(config, depth=depth, width=width)
+        # One network for all segments: its frequencies are those that one segment has.
+        bands = config.time_bands + math.ceil(math.log2(config.segments or 1))
+        config = dataclasses.replace(config, depth=depth, width=width, time_bands=bands)
         outputs = (3 * self.bases, 1) if changes_all else (3 * self.bases,)
         self.trunk = Trunk(config, center, half_size, outputs)
 
@@ -95,12 +102,16 @@ class SplitScene(nn.Module):
         self.deformation = make_deformation(config, center, half_size)
         self.appearance = AppearanceField(config, center, half_size)
         self.sh_degree, self.light = config.sh_degree, Light(center) if config.reflections else None
+        self.num_segments = config.segments or 1
+        self._rows: tuple[Tensor, segments.SegmentRows] | None = None
         self.set_dynamic(dynamic)
 
     def set_dynamic(self, dynamic: Gaussians) -> None:
-        """Replaces the dynamic Gaussians by others, which reflect as the scene does."""
+        """Replaces the dynamic Gaussians by others, which reflect as the scene does; without segments, all get 0."""
         if self.light is not None and dynamic.reflectances is None:
             dynamic.reflectances = nn.Parameter(dynamic.means.new_zeros(len(dynamic), self.light.size))
+        if self.num_segments > 1 and dynamic.segments is None:
+            dynamic.segments = torch.zeros(len(dynamic), dtype=torch.int64, device=dynamic.means.device)
         self.dynamic = dynamic
 
     @staticmethod
@@ -164,8 +175,7 @@ class SplitScene(nn.Module):
             The Gaussians, and [M, 10] offsets of the points; None without points, dynamic Gaussians or deformation.
         """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
-        residuals = logit_residuals = None
-        offsets = other_offsets = None
+        residuals = logit_residuals = offsets = other_offsets = None
         with concurrently(device) as beside:
             with beside:
                 if use_appearance and len(static):
@@ -173,9 +183,10 @@ class SplitScene(nn.Module):
                 sh = join_sh(static.raw(), dynamic.raw(), residuals)
             if use_deformation and len(dynamic):
                 own = PointsInTime(dynamic.means, time if time_noise is None else time + time_noise)
-                offsets, other_offsets = self._offsets(own, points)
+                offsets, other_offsets = self._offsets(own, points, time)
         static_changes, dynamic_changes = Changes(logit_residuals=logit_residuals), Changes(offsets)
         geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
+        geometry = geometry._replace(opacities=self._faded(geometry.opacities, time))
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
         splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree)
         return self._reflecting(splats), other_offsets
@@ -189,14 +200,52 @@ class SplitScene(nn.Module):
         reflected = reflections(self.light, dynamic.log_scales, quats, dynamic.reflectances)
         return dataclasses.replace(splats, reflections=reflected)
 
-    def _offsets(self, own: PointsInTime, others: PointsInTime | None) -> tuple[Tensor, Tensor | None]:
-        """Offsets of the deformation at the first points, and at the others if there are any."""
+    def _offsets(
+        self, own: PointsInTime, others: PointsInTime | None, time: Float[Tensor, "1"]
+    ) -> tuple[Tensor, Tensor | None]:
+        """Offsets of the deformation at the dynamic Gaussians, and at other points around a time if there are any."""
+        if self.num_segments > 1:
+            others_offsets = None if others is None else self.around(time)[1](*others)
+            return self.deformation(*own, time, self.rows()), others_offsets
         if others is None:
             return self.deformation(*own), None
         sizes = [len(own.means), len(others.means)]
         times = torch.cat([own.times.expand(sizes[0]), others.times])
         offsets, other_offsets = self.deformation(torch.cat([own.means, others.means]), times).split(sizes)
         return offsets, other_offsets
+
+    def offsets(self, time: Float[Tensor, "1"], noise: Float[Tensor, " T"] | None = None) -> Float[Tensor, "D 10"]:
+        """Offsets of the dynamic Gaussians at a time; one number or [D] of noise is added to it for the network."""
+        return self._offsets(PointsInTime(self.dynamic.means, time if noise is None else time + noise), None, time)[0]
+
+    def _faded(self, opacities: Float[Tensor, " N"], time: Float[Tensor, "1"]) -> Float[Tensor, " N"]:
+        """Opacities, of which those of the dynamic Gaussians are 0 outside of their segments, if they have any."""
+        dynamic = self.dynamic
+        if dynamic.segments is None:
+            return opacities
+        weights = segments.weights(time, self.num_segments).index_select(0, dynamic.segments)
+        return torch.cat([opacities[: len(self.static)], segments.faded(dynamic.logit_opacities, weights)])
+
+    def rows(self) -> segments.SegmentRows:
+        """The dynamic Gaussians by segment; reads back from the device when they were replaced."""
+        found = self.dynamic.segments
+        assert found is not None
+        if self._rows is None or self._rows[0] is not found:
+            self._rows = found, segments.rows_by_segment(found, self.num_segments)
+        return self._rows[1]
+
+    def around(self, time: Float[Tensor, "1"]) -> tuple[Float[Tensor, "N 3"], Callable[[Tensor, Tensor], Tensor]]:
+        """Canonical positions of the dynamic Gaussians at a time, and a function as of ``fields.FIELDS`` for them.
+
+        Of several segments it is the one with the largest weight, in which some positions may be there more than once.
+        """
+        means = self.dynamic.means.detach()
+        if not isinstance(self.deformation, SegmentedDeformation):
+            return means, self.deformation
+        segment = segments.nearest(time, self.num_segments)
+        if len(means):
+            means = means.index_select(0, self.rows().rows.index_select(0, segment)[0])
+        return means, partial(self.deformation.at, segment)
 
     @torch.no_grad()
     def with_delays(
@@ -215,7 +264,7 @@ class SplitScene(nn.Module):
         means = self.dynamic.means
         if camera.motion is None or camera.duration == 0.0 or not len(means):
             return noise
-        offsets = self.deformation(means, time if noise is None else time + noise)
+        offsets = self.offsets(time, noise)
         delays = camera.delays(means + offsets[:, :3])
         return delays if noise is None else delays + noise
 

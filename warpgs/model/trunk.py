@@ -54,15 +54,18 @@ class Trunk(nn.Module):
         layers = split(values, self.shapes)
         return [Layer(weight[:r, :c], bias[:r]) for (weight, bias), (r, c) in zip(layers, self.sizes, strict=True)]
 
-    def forward(self, means: Float[Tensor, "N 3"], time: Float[Tensor, " T"]) -> tuple[Tensor, ...]:
+    def forward(
+        self, means: Float[Tensor, "N 3"], time: Float[Tensor, " T"], values: Float[Tensor, " values"] | None = None
+    ) -> tuple[Tensor, ...]:
         """Evaluates the network at N positions and one or N times in [0, 1]: [N, number] for each of ``outputs``.
 
-        No gradient flows to the positions.
+        No gradient flows to the positions. ``values`` are others than its own.
         """
+        values = self.values if values is None else values
         half = self.uses_half and means.is_cuda
         box = (self.center, self.half_size)
         inputs = encode(means.detach(), time, self.bands, box, self.reserved_columns, half, self.raw)
-        return perceptron(inputs, self.values, self.shapes, self.skip, self.outputs, len(means))
+        return perceptron(inputs, values, self.shapes, self.skip, self.outputs, len(means))
 
 
 def in_single_precision(model: nn.Module) -> nn.Module:

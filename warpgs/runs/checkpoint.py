@@ -326,6 +326,9 @@ def load_scene(checkpoint: Checkpoint, config: ModelConfig, has_dome: bool = Fal
         raise ValueError(f"{path} does not hold a scene of this run's config: {reason}") from error
     if not all(bool(torch.isfinite(tensor).all()) for tensor in state.values()):
         raise DamagedCheckpointError(path, "its scene holds values that are not finite")
+    found = scene.dynamic.segments
+    if found is not None and not bool(((found >= 0) & (found < scene.num_segments)).all()):
+        raise DamagedCheckpointError(path, f"a dynamic Gaussian has a segment outside of 0 to {scene.num_segments - 1}")
     if checkpoint.metadata.sh_degree > config.sh_degree:
         raise DamagedCheckpointError(path, f"sh_degree cannot be {checkpoint.metadata.sh_degree}")
     return scene

@@ -144,6 +144,7 @@ FORMER: dict[str, dict[str, Any]] = {
         "min_period": 0.0,
         "raw_input": True,
         "reflections": False,
+        "segments": 1,
         "tracks": True,
     },
     "optim": {"means_anneal": "run", "poses": 0.0},

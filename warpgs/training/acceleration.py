@@ -37,7 +37,7 @@ def sampled_points(
     Returns:
         K canonical positions, at most ``MAX_SAMPLES``, at each of the three times; none without dynamic Gaussians.
     """
-    means = scene.dynamic.means.detach()
+    means, _ = scene.around(time)
     # Consecutive Gaussians, so that nothing is sorted or drawn: each belongs to as many samples as any other.
     count = min(len(means), MAX_SAMPLES)
     first = torch.arange(count, device=means.device)

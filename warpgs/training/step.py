@@ -125,6 +125,8 @@ class Step:
     def begin_density(self) -> None:
         """Lets density control start anew and invalidates the graph; call it after the Gaussians were replaced."""
         self.density.begin(len(self.scene.static) + len(self.scene.dynamic), self.views.device)
+        if self.scene.num_segments > 1 and len(self.scene.dynamic):
+            self.scene.rows()  # which a graph cannot read back from the device
         if self._graphs is not None:
             self._graphs.invalidate()
 

@@ -9,7 +9,8 @@ import torch
 
 from warpgs.command_line.interrupt import Interrupt
 from warpgs.config.presets import far_rates
-from warpgs.initialization import alignment, initialize
+from warpgs.initialization import alignment
+from warpgs.initialization.by_segment import dynamic_start
 from warpgs.initialization.start import Start
 from warpgs.model.scene import SplitScene
 from warpgs.runs import checkpoint
@@ -77,7 +78,16 @@ class Trainer:
     def _start_from(self, scene: SplitScene) -> None:
         """Replaces the scene on all ranks by that of rank 0, with a new optimizer."""
         optim.copy_first(list(optim.trained_parameters(scene.to(self.device), self.views.poses).values()))
+        self._copy_first_segments(scene)
         self._set_scene(scene)
+
+    def _copy_first_segments(self, scene: SplitScene) -> None:
+        """Replaces the segments of the dynamic Gaussians by those of rank 0, which has sent the Gaussians before."""
+        dynamic = scene.dynamic
+        if dynamic.segments is not None and ranks.num_ranks() > 1:
+            if not ranks.is_first():
+                dynamic.segments = dynamic.segments.new_empty(len(dynamic))
+            ranks.copy_first_(dynamic.segments)
 
     def _set_scene(self, scene: SplitScene) -> None:
         """Replaces the scene, with a new optimizer."""
@@ -141,6 +151,7 @@ class Trainer:
                 self._realign(plan.phase)
             self.step.density.adapt(self._adaptation(plan, logger))
         optim.copy_first(list(self.step.parameters().values()), self.step.optimizer)
+        self._copy_first_segments(self.scene)
         ranks.copy_first_(self.alignments)
         if plan.replaces_gaussians:
             self.step.begin_density()
@@ -173,7 +184,7 @@ class Trainer:
             logger.log(f"before stage I, {steps:,} steps fit the deformation to points on what moves")
         ranks.any_rank(False)  # finds a lost rank
         sources = (self.config, self.capture, self.views, self.alignments, self.scene.deformation)
-        found = initialize.dynamic_gaussians(
+        found = dynamic_start(
             *sources, self._generator("dynamic"), lambda: interrupt is not None and interrupt.requested
         )
         if ranks.any_rank(found is None) or found is None:

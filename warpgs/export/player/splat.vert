@@ -91,7 +91,9 @@ void main() {
     world = mix(mean(a, 1), mean(b, 1), fraction);
     quat = normalize(mix(qa, dot(qa, qb) < 0.0 ? -qb : qb, fraction));
     scales = exp(mix(logScales(a.w, 1), logScales(b.w, 1), fraction));
-    shade = texelFetch(dynamicColors, ivec3(texel, 0), 0);
+    int last = textureSize(dynamicColors, 0).z - 1; // 0 unless opacities change
+    vec4 next = texelFetch(dynamicColors, ivec3(texel, min(after, last)), 0);
+    shade = mix(texelFetch(dynamicColors, ivec3(texel, min(before, last)), 0), next, fraction);
   } else {
     uvec4 a = texelFetch(staticGeometry, ivec3(texel, 0), 0);
     world = mean(a, 0);

@@ -23,6 +23,7 @@ from warpgs.initialization.dynamic_points import (
 from warpgs.initialization.point_cloud import gaussians_at
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.scene import SplitScene
+from warpgs.model.segments import nearest
 from warpgs.rendering import render
 from warpgs.training.schedule import Phase
 from warpgs.views.views import View, Views
@@ -114,12 +115,17 @@ def gaussians_that_show(
         view_size: Of the capture [scene units].
     """
     canonical, kept = torch.empty_like(found.positions), torch.zeros(len(found.positions), dtype=torch.bool)
+    segments = torch.zeros(len(found.positions), dtype=torch.int64)
     for index in found.views.unique().tolist():
         chosen = found.views == index
         seen, time = found.positions[chosen].to(views.device), views.time(index)
-        x, reached = to_canonical(scene.deformation, seen, time, seen, MAX_INVERSION_ERROR * view_size)
+        _, deformation = scene.around(time)
+        x, reached = to_canonical(deformation, seen, time, seen, MAX_INVERSION_ERROR * view_size)
         canonical[chosen], kept[chosen] = x.cpu(), reached.cpu()
-    return gaussians_at(canonical[kept], found.colors[kept], config.model.sh_degree, MAX_SCALE * view_size)
+        segments[chosen] = nearest(time.cpu(), scene.num_segments)
+    added = gaussians_at(canonical[kept], found.colors[kept], config.model.sh_degree, MAX_SCALE * view_size)
+    added.segments = segments[kept]
+    return added
 
 
 def reseed(at: Adaptation) -> None:
@@ -138,6 +144,7 @@ def reseed(at: Adaptation) -> None:
         added = gaussians_that_show(found, scene, views, config, at.capture.view_size)
         if not len(added) + len(scene.dynamic):
             added = gaussians_in_box(at.capture, count, config, generator)
+            added.segments = torch.arange(count) % scene.num_segments
         append(scene.dynamic, at.optimizer, added)
         lost = f"{fraction:.0%} of the dynamic pixels show no dynamic Gaussian"
         limit = ", as many as --densify.max-gaussians allows" if count == capacity else ""

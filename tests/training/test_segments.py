@@ -1,0 +1,94 @@
+"""Training with several segments of time."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from tests import plain, tiny
+from warpgs.initialization.plan import make_plan
+from warpgs.model.segments import nearest, window
+from warpgs.runs import checkpoint
+from warpgs.runs.config_file import read_config
+from warpgs.runs.run import Run
+
+pytestmark = pytest.mark.usefixtures("quickly")
+
+CONFIG = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, segments=2))
+
+
+@pytest.fixture(scope="module")
+def whole(data, tmp_path_factory):
+    """A run without interruption."""
+    folder = tmp_path_factory.mktemp("segments")
+    Run.create(folder, plain.plan(dataclasses.replace(CONFIG, data=data)))
+    assert tiny.train(tiny.trainer(data, folder, CONFIG))
+    return folder
+
+
+def test_dynamic_gaussians_of_each_segment_start_where_its_frames_show_them(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path, CONFIG)
+    trainer.iteration = trainer.protocol.stage1.start
+    trainer._add_dynamic_gaussians()
+    dynamic, networks = trainer.scene.dynamic, trainer.scene.deformation.network.trunk.values
+    assert dynamic.segments.bincount().tolist() == [tiny.MODEL.dynamic_points] * 2
+    assert not torch.equal(networks[0], networks[1])
+    times = torch.tensor([trainer.capture.cameras[name].time for name in trainer.capture.train])
+    for segment in range(2):
+        start, end = window(segment, 2)
+        others = times[(times < start) | (times > end)]
+        assert len(others)
+        assert (nearest(others, 2) != segment).all()
+
+
+def test_both_segments_are_trained_to_the_end(whole):
+    first, last = (checkpoint.load(path).tensors for path in (checkpoint.path_of(whole, 7), _newest(whole)))
+    values = "scene.deformation.network.trunk.values"
+    assert (first[values] != last[values]).any(1).all()
+    assert last["scene.dynamic.segments"].unique().tolist() == [0, 1]
+
+
+# After the first densification, and at the start of stage II.
+@pytest.mark.parametrize("stop", [9, 22])
+def test_a_resumed_run_is_bit_identical(data, whole, tmp_path, stop):
+    first = tiny.trainer(data, tmp_path, CONFIG)
+    assert not tiny.train(first, tiny.StopWhen(lambda: first.iteration >= stop))
+    trainer = tiny.trainer(data, tmp_path, CONFIG)
+    trainer.restore_newest(print)
+    assert tiny.train(trainer)
+    assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
+
+
+def test_a_run_opens_as_a_scene_that_changes_its_gaussians_over_time(whole):
+    trained = Run(whole, read_config(whole)).trained_scene()
+    num_static = len(trained.scene.static)
+    seen = [trained.splats(time).opacities[num_static:] > 0 for time in (0.1, 0.5, 0.9)]
+    assert not (seen[0] & seen[2]).any()
+    assert (seen[1] == (seen[0] | seen[2])).all()
+
+
+def test_a_checkpoint_with_a_segment_that_there_is_not_is_damaged(whole, tmp_path):
+    loaded = checkpoint.load(_newest(whole))
+    loaded.tensors["scene.dynamic.segments"][0] = 2
+    with pytest.raises(checkpoint.DamagedCheckpointError, match="segment outside of 0 to 1"):
+        checkpoint.load_scene(loaded, CONFIG.model)
+
+
+def test_a_plan_knows_the_number_of_segments(data, monkeypatch):
+    capture = tiny.trainer(data, data, tiny.CONFIG).capture
+    config = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, segments=None))
+    assert make_plan(config, capture)[0].model.segments == 1
+    monkeypatch.setattr("warpgs.model.segments.MAX_TIMES", 3)
+    plan, notes = make_plan(config, capture)
+    assert plan.model.segments == 2
+    assert any("2 segments of about 4 times" in note for note in notes)
+
+
+def test_splines_and_segments_exclude_each_other(data):
+    config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, deformation="splines"))
+    with pytest.raises(ValueError, match=r'model.segments 2 needs model.deformation "mlp", got "splines"'):
+        make_plan(config, tiny.trainer(data, data, tiny.CONFIG).capture)
+
+
+def _newest(run):
+    return checkpoint.list_checkpoints(run)[-1]

@@ -1,0 +1,92 @@
+"""The dynamic Gaussians that stage I starts from, of each segment of time."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from warpgs.config import TrainConfig
+from warpgs.data.capture import Capture, Frame
+from warpgs.model.gaussians import Gaussians
+from warpgs.model.segmented_deformation import SegmentedDeformation
+from warpgs.model.segments import window
+from warpgs.views.views import View, Views
+
+from .initialize import DynamicStart, dynamic_gaussians
+
+
+class _Part(Views):
+    """Some of the views, in their order."""
+
+    def __init__(self, views: Views, indices: Sequence[int]) -> None:
+        self._whole, self._indices, self.device = views, indices, views.device
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, index: int) -> View:
+        return self._whole[self._indices[index]]
+
+    @property
+    def videos(self) -> list[list[int]]:
+        position = {index: k for k, index in enumerate(self._indices)}
+        return [[position[index] for index in video if index in position] for video in self._whole.videos]
+
+    def each(self, indices: Sequence[int]) -> Iterator[View]:
+        return self._whole.each([self._indices[k] for k in indices])
+
+    def frames(self, indices: Sequence[int]) -> Iterator[Frame]:
+        return self._whole.frames([self._indices[k] for k in indices])
+
+
+def dynamic_start(
+    config: TrainConfig,
+    capture: Capture,
+    views: Views,
+    alignments: Float[Tensor, "T 2"],
+    deformation: nn.Module,
+    generator: torch.Generator,
+    is_stopped: Callable[[], bool] = bool,
+) -> DynamicStart | None:
+    """``dynamic_gaussians``, of several segments each by its own views and their times in its window."""
+    sources = (generator, is_stopped)
+    if not isinstance(deformation, SegmentedDeformation):
+        return dynamic_gaussians(config, capture, views, alignments, deformation, *sources)
+    found, networks = [], [deformation.of(segment) for segment in range(deformation.num)]
+    for segment, network in enumerate(networks):
+        part, indices = _part(capture, segment, deformation.num)
+        if not indices:
+            found.append(DynamicStart(Gaussians.empty(0, config.model.sh_degree)))
+            continue
+        start = dynamic_gaussians(config, part, _Part(views, indices), alignments[indices], network, *sources)
+        if start is None:
+            return None
+        found.append(start)
+    for segment, network in enumerate(networks):
+        deformation.replace(segment, network)
+    return _joined(found)
+
+
+def _part(capture: Capture, segment: int, num: int) -> tuple[Capture, list[int]]:
+    """The training frames in the window of a segment with their times in it, and their indices."""
+    start, end = window(segment, num)
+    cameras = [capture.cameras[name] for name in capture.train]
+    indices = [k for k, camera in enumerate(cameras) if start <= camera.time <= end]
+    if not indices:
+        return capture, []
+    names = [capture.train[k] for k in indices]
+    times = [(cameras[k].time - start) / (end - start) for k in indices]
+    inside = {name: dataclasses.replace(capture.cameras[name], time=t) for name, t in zip(names, times, strict=True)}
+    return capture.split(names, ()).with_cameras(inside), indices
+
+
+def _joined(found: Sequence[DynamicStart]) -> DynamicStart:
+    for segment, start in enumerate(found):
+        num, device = len(start.gaussians), start.gaussians.means.device
+        start.gaussians.segments = torch.full((num,), segment, dtype=torch.int64, device=device)
+    gaussians = found[0].gaussians
+    for start in found[1:]:
+        gaussians.append(start.gaussians)
+    return DynamicStart(gaussians, any(s.lacks_fit for s in found), sum(s.num_tracks for s in found))
