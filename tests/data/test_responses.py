@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import threading
 
 import pytest
 import torch
@@ -45,6 +46,14 @@ def test_gains_of_cameras_are_found(plain):
     assert {*found} == {*GAINS}
     for i, gain in GAINS.items():
         assert found[i].at(0.5).tolist() == pytest.approx(gain.tolist(), rel=0.03)
+
+
+def test_frames_are_compared_in_threads(plain):
+    threads = set()
+    read = lambda name: threads.add(threading.get_ident()) or plain.frame(name)  # noqa: E731
+    camera_responses(dataclasses.replace(plain, read=read))
+    assert threads
+    assert threading.get_ident() not in threads
 
 
 def test_cameras_that_are_alike_have_no_gains(plain):

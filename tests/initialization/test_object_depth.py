@@ -27,6 +27,7 @@ from warpgs.initialization.initialize import MAX_COLOR_VIEWS
 from warpgs.initialization.object_depth import SIZE_ERROR, ObjectDepth, fill_object_depth
 from warpgs.initialization.objects import MIN_VISIBLE, find_objects
 from warpgs.initialization.prepare_start import prepare_start
+from warpgs.initialization.seen_objects import see_objects
 from warpgs.runtime import launch
 from warpgs.training.trainer import Trainer
 from warpgs.views.view_reader import ViewReader
@@ -600,6 +601,15 @@ def test_what_comes_before_training_reads_each_view_once(monkeypatch):
     assert {index: reads[index] for index in range(NUM) if index not in few} == {
         index: 1 for index in range(NUM) if index not in few
     }
+
+
+def test_objects_are_measured_in_threads():
+    views, threads = views_of(capture_of(MASKS)), set()
+    found = module.find_all_objects(views)
+    measured = [*see_objects(views._capture, views, found, lambda seen: threads.add(threading.get_ident()) or seen)]
+    assert [item for item, _ in measured] == found
+    assert all(seen.item is item for item, seen in measured)
+    assert threading.get_ident() not in threads
 
 
 def test_a_capture_with_depth_pretrains(tmp_path):

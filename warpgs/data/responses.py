@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain, islice
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .capture import Capture, Frame
+from .read_ahead import ReadAhead
 from .sampling import evenly_spaced
 
 DARKEST, BRIGHTEST = 0.04, 0.96
@@ -82,11 +84,12 @@ def camera_responses(capture: Capture) -> dict[int, Response]:
     if len(train) < 2 or not len(capture.points):
         return {}
     masked, points = capture.assuming("masks"), capture.points[:: -(-len(capture.points) // MAX_POINTS)]
-    times, logs = {}, {}
-    for i, names in (train | others).items():
-        some = evenly_spaced(names, NUM_FRAMES)
-        times[i] = np.array([capture.cameras[name].time for name in some])
-        logs[i] = np.stack([_logs_in(masked.frame(name), points) for name in some])
+    some = {i: evenly_spaced(names, NUM_FRAMES) for i, names in (train | others).items()}
+    times = {i: np.array([capture.cameras[name].time for name in names]) for i, names in some.items()}
+    found_in = ReadAhead[str, np.ndarray](lambda name: _logs_in(masked.frame(name), points)).each(
+        [*chain(*some.values())]
+    )
+    logs = {i: np.stack([*islice(found_in, len(names))]) for i, names in some.items()}
     colors = _polished(np.stack([_median(logs[i]) for i in train]))
     found = {i: curve for i in times if (curve := _drift(times[i], logs[i], colors)) is not None}
     of_train = [curve for i, curve in found.items() if i in train]
@@ -103,8 +106,7 @@ def in_response(image: Float[Tensor, "H W 3"], frame: Frame, responses: Mapping[
 def _logs_in(frame: Frame, points: Float[Tensor, "P 3"]) -> Float[np.ndarray, "P 3"]:
     """Logarithms of what a frame records at points; NaN where not compared."""
     row, column, _, is_visible = frame.camera.project(points)
-    image = cv2.blur(frame.image.numpy(), (3, 3)).astype(np.float64) / 255.0
-    values = image[row.numpy(), column.numpy()]
+    values = cv2.blur(frame.image.numpy(), (3, 3))[row.numpy(), column.numpy()].astype(np.float64) / 255.0
     known = is_visible.numpy() & ((values > DARKEST) & (values < BRIGHTEST)).all(1)
     if frame.static_mask is not None:
         known &= frame.static_mask[row, column].numpy()

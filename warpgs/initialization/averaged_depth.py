@@ -19,7 +19,7 @@ from warpgs.views.views import View, Views
 from .depth_by_size import paint
 from .objects import MovingObject
 from .point_cloud import filled
-from .seen_objects import Sizes, see_objects
+from .seen_objects import SeenObject, Sizes, see_objects
 
 RIM = 0.008
 """Width of the rim of dynamic objects in which a network's depth is replaced, as a fraction of the image's longer side:
@@ -51,13 +51,12 @@ def average_depths(
     cameras = [capture.cameras[name] for name in capture.train]
     depths = [_scaled_depth(*of) for of in zip(views, alignments, cameras, strict=True)]
     images: dict[int, Tensor] = {}
-    for seen in see_objects(capture, views, objects):
-        if seen.item.is_mostly_cut:
-            continue
-        known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in seen.item.pixels.items()}
+    whole = [item for item in objects if not item.is_mostly_cut]
+    for item, sizes in see_objects(capture, views, whole, SeenObject.sizes):
+        known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in item.pixels.items()}
         times = {index: cameras[index].time for index in known}
-        corrections = _corrections(seen.sizes(), known, times, 1.0 - weight)
-        paint(images, seen, {k: filled(len(seen.item.pixels[k]), 1.0 / value) for k, value in corrections.items()})
+        corrections = _corrections(sizes, known, times, 1.0 - weight)
+        paint(images, views, item, {k: filled(len(item.pixels[k]), 1.0 / value) for k, value in corrections.items()})
     found = {index: image for index, image in images.items() if index in aligned}
     for index, factor in found.items():
         static = views[index].static_mask.cpu()

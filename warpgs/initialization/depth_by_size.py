@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from warpgs.data.capture import Capture
-from warpgs.data.dynamic_regions import MIN_FRAMES
+from warpgs.data.dynamic_regions import MIN_FRAMES, scaled_size
 from warpgs.views.views import Views
 
 from .objects import MovingObject
@@ -33,26 +33,30 @@ def depth_by_size(capture: Capture, views: Views, objects: Sequence[MovingObject
         of objects that are hardly ever whole, of flat ones as far away as the static points around them.
     """
     images: dict[int, Tensor] = {}
-    for seen in see_objects(capture, views, objects):
-        if not seen.item.is_mostly_cut:
-            paint(images, seen, _depths(seen))
-        elif images:  # without any depth, dynamic Gaussians start in front of the points around them
-            paint(images, seen, _depths_around(seen))
+    whole, cut = ([item for item in objects if item.is_mostly_cut == is_cut] for is_cut in (False, True))
+    for item, depths in see_objects(capture, views, whole, _depths):
+        paint(images, views, item, depths)
+    if images:  # without any depth, dynamic Gaussians start in front of the points around them
+        for item, depths in see_objects(capture, views, cut, _depths_around):
+            paint(images, views, item, depths)
     return images
 
 
-def paint(images: dict[int, Tensor], seen: SeenObject, values: Mapping[int, Float[Tensor, " P"]]) -> None:
+def paint(
+    images: dict[int, Tensor], views: Views, item: MovingObject, values: Mapping[int, Float[Tensor, " P"]]
+) -> None:
     """Writes values of an object's pixels into images of the scaled masks, where these have none yet.
 
     Args:
         images: [h, w] values by index of the frame, NaN where there are none; images that are missing are added.
-        seen: The object.
+        views: The training views.
+        item: The object.
         values: Values of its pixels by index of the frame.
     """
     for index, found in values.items():
-        shape = seen.views[index].size[::-1]
+        shape = scaled_size(views.camera(index))[::-1]
         image = images.setdefault(index, torch.full(shape, torch.nan, dtype=torch.float32)).view(-1)
-        pixels = torch.from_numpy(seen.item.pixels[index]).long()
+        pixels = torch.from_numpy(item.pixels[index]).long()
         image[pixels] = torch.where(image[pixels].isnan(), found, image[pixels])
 
 

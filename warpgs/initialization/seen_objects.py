@@ -3,8 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, partial
-from operator import attrgetter
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -15,6 +14,7 @@ from torch import Tensor
 from warpgs.cameras import Camera
 from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import scaled_size
+from warpgs.data.read_ahead import ReadAhead
 from warpgs.views.views import Views
 
 from .objects import MovingObject
@@ -33,24 +33,32 @@ the factor. Both tolerate outliers."""
 MAX_POINTS = 10_000
 """Maximum number of static points that are projected into each frame."""
 
+Measured = TypeVar("Measured")
+
 Points = tuple[Int[Tensor, " P"], Int[Tensor, " P"], Float[Tensor, " P"]]
 """Rows, columns and depths [scene units] of points."""
 
 
-def see_objects(capture: Capture, views: Views, objects: Sequence[MovingObject]) -> Iterator["SeenObject"]:
-    """The objects as a capture's training frames see them, mostly cut ones last.
-
-    Objects that cannot be told apart are omitted.
+def see_objects(
+    capture: Capture, views: Views, objects: Sequence[MovingObject], measure: Callable[["SeenObject"], Measured]
+) -> Iterator[tuple[MovingObject, Measured]]:
+    """Measures objects as a capture's training frames see them, in threads; those that cannot be told apart not.
 
     Args:
         capture: The capture, with static points.
         views: Its training views.
-        objects: All of its objects.
+        objects: The objects.
+        measure: Called with each of them, by several threads at once.
     """
     points_of = cache(partial(_static_points, capture, views))
-    for item in sorted((item for item in objects if not item.is_mixture), key=attrgetter("is_mostly_cut")):
-        seen_by = {k: ObjectView(pixels, capture.cameras[capture.train[k]]) for k, pixels in item.pixels.items()}
-        yield SeenObject(item, seen_by, points_of)
+    told_apart = [item for item in objects if not item.is_mixture]
+
+    def measured(k: int) -> Measured:
+        pixels_of = told_apart[k].pixels
+        seen_by = {index: ObjectView(pixels, views.camera(index)) for index, pixels in pixels_of.items()}
+        return measure(SeenObject(told_apart[k], seen_by, points_of))
+
+    yield from zip(told_apart, ReadAhead(measured).each(range(len(told_apart))), strict=True)
 
 
 def _static_points(capture: Capture, views: Views, index: int) -> Points:
