@@ -38,8 +38,8 @@ VAL_RATE = 2.0
 """Evaluation frames per second."""
 
 
-def _leap(t: float) -> float:
-    """How far the ring has gone upwards, 0 to 1."""
+def _away(t: float) -> float:
+    """How far the ring has gone to the left, through the wall, 0 to 1."""
     in_minute = t % MINUTE - (MINUTE - AWAY)
     x = min(1.0, max(0.0, min(in_minute, AWAY - in_minute) / WAY))
     return x * x * (3.0 - 2.0 * x)
@@ -49,7 +49,7 @@ def moving_bodies(t: float) -> list[Body]:
     """All that moves at a time [s]."""
     ring, blob = studio.moving_bodies(t / PERIODS[1])[0], studio.moving_bodies(t / PERIODS[2])[1]
     x, y, z = ring.center
-    bodies = [dataclasses.replace(ring, center=(x, y, z + 2.5 * _leap(t))), blob]
+    bodies = [dataclasses.replace(ring, center=(x - 6.0 * _away(t), y, z)), blob]
     number, since = divmod(t, EVERY)
     if since <= STAY:
         random = np.random.default_rng(int(number))
@@ -132,7 +132,7 @@ if __name__ == "__main__":
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--size", default="854x480")
     parser.add_argument("--points", type=int, default=30_000)
-    parser.add_argument("--samples", type=int, default=4)
+    parser.add_argument("--samples", type=int, default=8)
     given = parser.parse_args()
     width, height = map(int, given.size.split("x"))
     options = {"num_points": given.points, "num_samples": given.samples}

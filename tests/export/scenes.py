@@ -1,5 +1,7 @@
 """Small clouds and a small trained scene for tests."""
 
+import dataclasses
+
 import torch
 
 from tests import plain, tiny
@@ -60,16 +62,26 @@ def clouds(num_static=40, num_dynamic=20, seed=0):
     return Clouds(trained_scene(num_static, num_dynamic, seed))
 
 
-def trained_scene(num_static=40, num_dynamic=20, seed=0):
+def segmented():
+    """The clouds of a scene with two segments of time, which have every second dynamic Gaussian each, for exports."""
+    scene = trained_scene(segments=2)
+    scene.scene.deformation.is_complete = True
+    return Clouds(scene)
+
+
+def trained_scene(num_static=40, num_dynamic=20, seed=0, segments=1):
     """A scene whose networks have a visible effect."""
     torch.manual_seed(seed)
-    scene = SplitScene.empty(num_static, num_dynamic, tiny.MODEL)
+    model = dataclasses.replace(tiny.MODEL, segments=segments)
+    scene = SplitScene.empty(num_static, num_dynamic, model)
     for part in (scene.static, scene.dynamic):
-        part.load_state_dict(_random(len(part)).state_dict())
+        part.load_state_dict(_random(len(part)).state_dict(), strict=part.segments is None)
+    if segments > 1:
+        scene.dynamic.segments = torch.arange(num_dynamic) % segments
     for field in (scene.deformation, scene.appearance):
         for parameter in field.parameters():
             torch.nn.init.normal_(parameter, std=0.15)
-    return TrainedScene(scene.requires_grad_(False), plain.plan(plain.config(model=tiny.MODEL)), METADATA)
+    return TrainedScene(scene.requires_grad_(False), plain.plan(plain.config(model=model)), METADATA)
 
 
 def _random(num):

@@ -12,7 +12,7 @@ from warpgs.export import fourdgs, usd
 from warpgs.export.clouds import Clouds
 from warpgs.export.job import Job
 from warpgs.export.options import Export
-from warpgs.formats.cloud import Cloud, logit
+from warpgs.formats.cloud import Cloud, logit, sigmoid
 from warpgs.formats.rotation import rotated
 from warpgs.model.gaussians import SH_C0
 from warpgs.runs.run import Run
@@ -200,6 +200,22 @@ def test_a_container_shows_the_scene_at_its_key_times(container, clouds, key):
     sh = ((state["rgb"] - 0.5) / SH_C0)[:, None]
     back = cloud_of(state["centers"], state["rotations"], state["scales"], state["opacity"], sh)
     assert psnr(back, truth) > 38
+
+
+@pytest.mark.parametrize("key", [1, 3])
+def test_a_container_shows_the_dynamic_gaussians_of_each_segment_in_its_time(finished_run, tmp_path, key):
+    pytest.importorskip("fourdgs", reason="fourdgs is not installed (extra 'export')")
+    from fourdgs import keyframe_delta_file as file
+
+    clouds = scenes.segmented()
+    fourdgs.write_fourdgs(job(clouds, finished_run, tmp_path))
+    time = key * (SECONDS / KEYS)  # as written: a rounding error earlier, the sample before it is shown
+    state = file.render_at(file.decode_streamed((tmp_path / "scene.4dgs").read_bytes()), time)
+    truth = expected(clouds, key / KEYS)
+    opacities = sigmoid(truth.logit_opacities)
+    assert np.abs(np.asarray(state["opacity"]).ravel() - opacities).max() < 0.01
+    assert ((opacities[40:] > 0.5) == (np.arange(20) % 2 == key // 3)).all()
+    assert np.abs(state["centers"] - truth.means).max() < 0.03 * float(np.median(np.exp(truth.log_scales)))
 
 
 def test_gaussians_move_in_straight_lines_between_samples(container, clouds):

@@ -203,6 +203,15 @@ def test_a_slow_frame_skips_times_instead_of_slowing_down(browser, page):
     assert advanced == pytest.approx(0.8 * float(browser.value("document.getElementById('speed').value")), abs=1e-6)
 
 
+@pytest.mark.parametrize("time", [0.25, 0.5, 0.75])
+def test_a_page_shows_the_dynamic_gaussians_of_each_segment_in_its_time(browser, tmp_path, time):
+    clouds = scenes.segmented()
+    write_page(tmp_path / "segments.html", bake(clouds.at, evenly_spaced(5), precision=4.0), start())
+    image = shown(browser, tmp_path / "segments.html", f"time={time}")
+    assert psnr(image, expected(clouds.at(time))) > 36
+    assert psnr(image, expected(clouds.at(1.0 - time if time != 0.5 else 0.0))) < 30
+
+
 @pytest.mark.parametrize(("static", "dynamic"), [(30, 0), (0, 12)])
 def test_a_scene_with_one_branch_and_one_key_time_is_shown(browser, tmp_path, static, dynamic):
     baked = bake(scenes.clouds(static, dynamic).at, [0.0])
