@@ -603,6 +603,14 @@ def test_what_comes_before_training_reads_each_view_once(monkeypatch):
     }
 
 
+def test_objects_are_followed_without_reading_views_again(monkeypatch):
+    masks, images = two_balls(np.linspace(-60, -33, NUM))
+    views = views_of(capture_of(masks, images=images), resident_bytes=0)
+    assert views.glances
+    monkeypatch.setattr(ViewReader, "_pixels", lambda *_, **__: pytest.fail("read again"))
+    assert len(module.find_all_objects(views)) > 1
+
+
 def test_objects_are_measured_in_threads():
     views, threads = views_of(capture_of(MASKS)), set()
     found = module.find_all_objects(views)

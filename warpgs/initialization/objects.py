@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int
 
-from warpgs.data.capture import Frame
 from warpgs.data.dynamic_regions import MIN_FRAMES, dynamic_regions, is_cut, scaled_size
-from warpgs.data.optical_flow import MIN_SIDE, flow_between, grey_at
+from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between
 from warpgs.runtime.launch import on_all_cores
+from warpgs.views.glance import Glance
 from warpgs.views.views import Views
 
 MIN_OVERLAP = 0.3
@@ -140,8 +140,8 @@ class _Follower:
         """Labels the pixels of a region of several objects by where optical flow leads to in the frame before."""
         assert self._before is not None
         assert self._labels is not None
-        before, frame = self._views.frame(self._before), self._views.frame(index)
-        carried = np.where(region, _carried(self._labels, before, frame), NOTHING)
+        before, after = (self._views.glances[k] for k in (self._before, index))
+        carried = np.where(region, _carried(self._labels, before, after), NOTHING)
         distances = [cv2.distanceTransform((carried != k).astype(np.uint8), cv2.DIST_L2, 5) for k in candidates]
         nearest = np.argmin(distances, axis=0)
         near = [(region & (nearest == k)).astype(np.float32) for k in range(len(candidates))]
@@ -157,12 +157,12 @@ class _Follower:
         return area < MIN_VISIBLE * len(item.pixels[last])
 
 
-def _carried(labels: Int[np.ndarray, "h w"], before: Frame, frame: Frame) -> Int[np.ndarray, "h w"]:
+def _carried(labels: Int[np.ndarray, "h w"], before: Glance, after: Glance) -> Int[np.ndarray, "h w"]:
     """The labels of the frame before, carried over by optical flow (DIS); ``NOTHING`` where it does not lead back."""
     height, width = labels.shape
     if min(height, width) < MIN_SIDE:
         return np.full_like(labels, NOTHING)
-    flow, leads_back = flow_between(*(grey_at(f, (width, height)) for f in (frame, before)))
+    flow, leads_back = flow_between(*(even_contrast(glance.grey) for glance in (after, before)))
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     column, row = np.rint(x + flow[..., 0]).astype(int), np.rint(y + flow[..., 1]).astype(int)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
