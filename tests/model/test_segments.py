@@ -5,7 +5,7 @@ import torch
 
 from tests import plain
 from tests.scenes import as_gaussians, error, generator, make_camera, make_splats
-from warpgs.model import segments
+from warpgs.model import segmented_deformation, segments
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import render
 
@@ -126,3 +126,18 @@ def test_gaussians_around_a_time_are_those_of_its_segment():
 @pytest.mark.parametrize(("num_times", "num"), [(1, 1), (160, 1), (899, 1), (901, 2), (5_400, 9)])
 def test_long_captures_have_several_segments(num_times, num):
     assert segments.default_number(num_times) == num
+
+
+@pytest.mark.parametrize("time", [EARLY, SEAM, torch.tensor([0.9])])
+def test_a_segment_that_is_evaluated_without_being_seen_changes_nothing(time, monkeypatch):
+    """As on CUDA, where two are evaluated at all times."""
+    later = (time * NUM).round().long().clamp(1, NUM - 1)
+    scene, results = make_scene(), []
+    for is_evaluated in (False, True):
+        if is_evaluated:
+            monkeypatch.setattr(segmented_deformation, "active", lambda *_: torch.cat([later - 1, later]))
+        scene.zero_grad()
+        image = render(scene.splats(time), make_camera()).joint.image
+        image.square().sum().backward()
+        results.append((image.detach(), *(parameter.grad for parameter in scene.parameters())))
+    assert all(a is b is None or torch.equal(a, b) for a, b in zip(*results, strict=True))
