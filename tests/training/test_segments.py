@@ -11,6 +11,7 @@ from warpgs.model.segments import nearest, window
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.run import Run
+from warpgs.runtime import ranks
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -57,6 +58,23 @@ def test_a_resumed_run_is_bit_identical(data, whole, tmp_path, stop):
     trainer.restore_newest(print)
     assert tiny.train(trainer)
     assert tiny.differences(tiny.state(tmp_path), tiny.state(whole)) == []
+
+
+@pytest.mark.parametrize(("action", "replaced"), [("reset", False), ("densify", True)])
+def test_ranks_leave_segments_where_cuda_graphs_read_them_unless_gaussians_are_replaced(
+    data, tmp_path, monkeypatch, action, replaced
+):
+    trainer = tiny.trainer(data, tmp_path, CONFIG)
+    trainer.iteration = trainer.protocol.stage1.start
+    trainer._add_dynamic_gaussians()
+    others = {"num_ranks": lambda: 2, "is_first": lambda: False, "any_rank": bool}
+    for name, value in (others | dict.fromkeys(("add_", "copy_first_"), lambda *tensors: None)).items():
+        monkeypatch.setattr(ranks, name, value)
+    monkeypatch.setattr(trainer.step.density, "merge", lambda: None)
+    monkeypatch.setattr(trainer.step, "begin_density", lambda: None)
+    before = trainer.scene.dynamic.segments
+    trainer._adapt(tiny.plan_to(trainer, action), None)
+    assert (trainer.scene.dynamic.segments is not before) == replaced
 
 
 def test_a_run_opens_as_a_scene_that_changes_its_gaussians_over_time(whole):

@@ -151,9 +151,9 @@ class Trainer:
                 self._realign(plan.phase)
             self.step.density.adapt(self._adaptation(plan, logger))
         optim.copy_first(list(self.step.parameters().values()), self.step.optimizer)
-        self._copy_first_segments(self.scene)
         ranks.copy_first_(self.alignments)
-        if plan.replaces_gaussians:
+        if plan.replaces_gaussians:  # otherwise CUDA graphs go on to read segments where they are
+            self._copy_first_segments(self.scene)
             self.step.begin_density()
 
     def _realign(self, phase: Phase) -> None:
