@@ -42,6 +42,17 @@ def test_the_sky_is_where_rays_hit_nothing(capture):
     assert sky.share == pytest.approx(float(torch.stack(hits).float().mean()), abs=0.02)
 
 
+def test_large_frames_are_reduced_before_they_are_kept(capture, monkeypatch):
+    whole = find_sky(capture)
+    monkeypatch.setattr("warpgs.initialization.sky.MAX_SIDE", 32)
+    sky = find_sky(capture)
+    assert {frame.camera.size for frame in sky.frames} == {(32, 18)}
+    kept = [tensor for frame in sky.frames for tensor in (frame.image, frame.static_mask, frame.inverse_depth)]
+    assert all(tensor.untyped_storage().nbytes() == tensor.nbytes for tensor in kept)
+    assert sky.share == pytest.approx(whole.share, abs=0.02)
+    assert sky.far == pytest.approx(whole.far, rel=0.05)
+
+
 def test_a_room_has_no_sky(cache):
     for depth in ("exact", "network", "none"):
         assert find_sky(opened(cache, depth, sky=False)) is None

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from warpgs.cameras import Camera
 from warpgs.data.capture import Capture, Frame
 from warpgs.data.depth_alignment import PointSamples, align_to_points, is_unusable, relative_errors, sample_points
 from warpgs.data.sampling import evenly_spaced, evenly_spaced_indices
@@ -42,7 +41,7 @@ class Sky:
     Attributes:
         share: Of the pixels of the frames that were looked at.
         far: Inverse depth up to which a pixel shows it [1 / scene units].
-        frames: Some frames.
+        frames: Some frames, reduced.
         masks: [H, W] where each of them shows it.
     """
 
@@ -122,12 +121,13 @@ def make_dome(capture: Capture, sky: Sky | None) -> Dome:
     else:
         frames = _some_frames(capture)
         masks = [_static(frame) for frame in frames]
-    colors = seen_colors([_reduced(*pair) for pair in zip(frames, masks, strict=True)], ROWS, COLUMNS)
+    seen = [(frame.camera, frame.image.float() / 255.0, mask) for frame, mask in zip(frames, masks, strict=True)]
+    colors = seen_colors(seen, ROWS, COLUMNS)
     return Dome(colors, -1.0 if sky is None else sky.far)
 
 
 def _some_frames(capture: Capture) -> list[Frame]:
-    return list(capture.frames(evenly_spaced(capture.train, MAX_FRAMES)))
+    return [_reduced(frame) for frame in capture.frames(evenly_spaced(capture.train, MAX_FRAMES))]
 
 
 def _eroded(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
@@ -135,9 +135,11 @@ def _eroded(mask: Bool[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
     return other == 0.0
 
 
-def _reduced(frame: Frame, mask: Bool[Tensor, "H W"]) -> tuple[Camera, Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """A camera that sees every n-th pixel, with its image and mask."""
+def _reduced(frame: Frame) -> Frame:
+    """A frame of every n-th pixel, in memory of its own."""
     step = max(1, round(max(frame.camera.size) / MAX_SIDE))
-    image, kept = frame.image[::step, ::step].float() / 255.0, mask[::step, ::step]
-    height, width = kept.shape
-    return frame.camera.resized(width, height), image, kept
+    tensors = (frame.image, frame.static_mask, frame.inverse_depth)
+    image, static, depth = (None if tensor is None else tensor[::step, ::step].clone() for tensor in tensors)
+    assert image is not None
+    height, width = image.shape[:2]
+    return Frame(frame.name, frame.camera.resized(width, height), image, static, depth)
