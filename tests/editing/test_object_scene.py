@@ -10,6 +10,8 @@ from tests.editing import moving
 from tests.export import scenes
 from warpgs.editing.edited_scene import edited, with_edits, with_ids
 from warpgs.editing.marked import Marked
+from warpgs.editing.object_scene import with_objects
+from warpgs.editing.objects import Objects
 from warpgs.editing.options import Editing, Edits
 from warpgs.model.gaussians import SH_C0
 
@@ -113,6 +115,28 @@ def test_the_mean_of_an_object_has_its_new_colour(scene):
     scene.scene.dynamic.sh_dc.clamp_(-1.0, 1.0)
     sh = edited(scene, Edits(recolor=(("2", 0.9, 0.1, 0.3),))).splats(0.0).sh
     assert (0.5 + SH_C0 * sh[SECOND, 0]).mean(0).tolist() == pytest.approx([0.9, 0.1, 0.3], abs=1e-3)
+
+
+def of_later_segment():
+    """A scene with two segments of time, and an object that only the second one has."""
+    scene = scenes.trained_scene(segments=2)
+    ids = np.concatenate([np.zeros(40, np.int32), scene.scene.dynamic.segments.numpy().astype(np.int32)])
+    return scene, Objects(ids, ("1",), 20)
+
+
+def test_an_object_of_a_later_segment_gets_its_new_colour():
+    scene, objects = of_later_segment()
+    sh = with_objects(scene, objects, Edits(recolor=(("1", 0.6, 0.2, 0.4),))).splats(1.0).sh
+    colors = 0.5 + SH_C0 * sh[torch.from_numpy(objects.ids == 1), 0]
+    assert colors.mean(0).tolist() == pytest.approx([0.6, 0.2, 0.4], abs=1e-3)
+
+
+@pytest.mark.parametrize("edits", [Edits(freeze=(("1", 0.5),)), Edits(shift=(("1", 0.1),))])
+def test_objects_of_several_segments_keep_their_times(edits):
+    option = "freeze" if edits.freeze else "shift"
+    expected = f"--{option}: this scene has 2 segments of time, expected one: train it with --model.segments 1"
+    with pytest.raises(ValueError, match=expected):
+        with_objects(*of_later_segment(), edits)
 
 
 def test_recoloured_gaussians_keep_how_colours_depend_on_the_direction(scene):

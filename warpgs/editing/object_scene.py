@@ -173,7 +173,8 @@ def number_of(objects: Objects, option: str, name: str) -> int:
 def _retimed(scene: TrainedScene, objects: Objects, edits: Edits) -> list[Retimed]:
     if scene.scene.num_segments > 1 and edits.freeze + edits.shift:
         option = "freeze" if edits.freeze else "shift"
-        raise ValueError(f"--{option}: this scene has {scene.scene.num_segments} segments of time, expected one")
+        num = f"{scene.scene.num_segments} segments of time"
+        raise ValueError(f"--{option}: this scene has {num}, expected one: train it with --model.segments 1")
     moving = {*objects.ids[len(scene.scene.static) :].tolist()}
     changes = []
     for option, times in (("freeze", edits.freeze), ("shift", edits.shift)):
@@ -191,6 +192,8 @@ def _toward(scene: TrainedScene, of_object: Bool[Tensor, " N"], color: Sequence[
     assert splats.sh is not None
     luma = torch.tensor(LUMA, dtype=torch.float32, device=scene.device)
     brightness = (0.5 + SH_C0 * splats.sh[of_object, 0]).clamp(0, 1) @ luma
-    weights = splats.opacities[of_object]
+    # Those of dynamic Gaussians are 0 outside of their segment of time.
+    opacities = torch.cat([splats.opacities[: len(scene.scene.static)], scene.scene.dynamic.opacities])
+    weights = opacities[of_object]
     mean = (brightness * weights).sum() / weights.sum().clamp_min(DARK)
     return torch.tensor(color, dtype=torch.float32, device=scene.device)[:, None] * luma / mean.clamp_min(DARK)
