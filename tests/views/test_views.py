@@ -103,6 +103,21 @@ def test_what_cameras_of_one_lens_show_is_computed_once(capture, monkeypatch):
     assert views[0].shown is views[2].shown is not views[1].shown
 
 
+def test_rays_of_many_lenses_are_not_kept(capture, monkeypatch):
+    views = views_of(with_circles(capture, [0.2, 0.3, 0.2]))
+    rays = views.lens_rays()
+    for k in range(3):
+        camera = views.camera(k)
+        found, expected = rays.at(torch.tensor([k])), camera.rays(camera.pixel_centers)
+        assert torch.equal(found.nan_to_num(-9.0), expected.nan_to_num(-9.0))
+    num_lenses = 2 + (len(views) > 3)
+    nbytes = rays.at(torch.tensor([0])).nbytes * num_lenses
+    monkeypatch.setattr(module, "MAX_RAY_BYTES", nbytes)
+    assert views.lens_rays() is not None
+    monkeypatch.setattr(module, "MAX_RAY_BYTES", nbytes - 1)
+    assert views.lens_rays() is None
+
+
 @pytest.mark.parametrize(("circles", "shares"), [([0.2, 0.2], True), ([0.2, 0.3], False)])
 def test_lenses_are_one_if_they_show_the_same_pixels(circles, shares):
     pinhole = along_z(20.0, (50, 37))

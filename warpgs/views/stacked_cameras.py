@@ -73,22 +73,25 @@ class LensRays:
     """
 
     def __init__(self, cameras: Sequence[Camera], device: torch.device) -> None:
-        found: dict[tuple[object, ...], int] = {}
-        rays: list[Tensor] = []
-        of_cameras: list[int] = []
-        for camera in cameras:
-            kind = None if camera.distortion is None else (camera.distortion.lens, camera.distortion.limit)
-            key = (kind, *camera.K.flatten().tolist(), *_intrinsics(camera))
-            if key not in found:
-                found[key] = len(rays)
-                on_device = camera.to(device)
-                rays.append(on_device.rays(on_device.pixel_centers))
-            of_cameras.append(found[key])
-        self._rays, self._of_cameras = torch.stack(rays), torch.tensor(of_cameras, device=device)
+        lenses = {_lens(camera): camera.to(device) for camera in cameras}
+        numbers = {lens: number for number, lens in enumerate(lenses)}
+        self._rays = torch.stack([camera.rays(camera.pixel_centers) for camera in lenses.values()])
+        self._of_cameras = torch.tensor([numbers[_lens(camera)] for camera in cameras], device=device)
+
+    @staticmethod
+    def nbytes(cameras: Sequence[Camera]) -> int:
+        """Memory that they take on the device [bytes]."""
+        return 3 * 4 * cameras[0].width * cameras[0].height * len({_lens(camera) for camera in cameras})
 
     def at(self, index: Int64[Tensor, "1"]) -> Float[Tensor, "P 3"]:
         """[H W, 3] those of the camera of an index on the device."""
         return self._rays.index_select(0, self._of_cameras.index_select(0, index))[0]
+
+
+def _lens(camera: Camera) -> tuple[object, ...]:
+    """What ``Camera.rays`` depends on."""
+    kind = None if camera.distortion is None else (camera.distortion.lens, camera.distortion.limit)
+    return kind, *camera.K.flatten().tolist(), *_intrinsics(camera)
 
 
 def _shown(cameras: Sequence[Camera], device: torch.device) -> list[Bool[Tensor, "H W"] | None]:

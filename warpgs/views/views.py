@@ -29,6 +29,9 @@ from .view_reader import Slot, ViewReader
 MANY, SAMPLED = 1_000, 500
 """Number of views above which steps that look at all of them look at some, and at how many of them."""
 
+MAX_RAY_BYTES = 1 << 30
+"""Maximum memory of the rays of lenses on the device [bytes]; rays of more are found again in each step."""
+
 
 class View(NamedTuple):
     """One training view on the device.
@@ -283,11 +286,12 @@ class Views:
         return [self._corrected(*pair) for pair in zip(cameras, indices, strict=True)]
 
     def lens_rays(self) -> LensRays | None:
-        """What each pixel of the views sees; None for pinholes and for images of several sizes."""
+        """What each pixel of the views sees; None for pinholes, images of several sizes, and too many lenses."""
         cameras = [self._capture.cameras[name] for name in self._capture.train]
         is_pinhole = all(camera.distortion is None for camera in cameras)
         have_one_size = len({camera.size for camera in cameras}) == 1
-        return None if is_pinhole or not have_one_size else LensRays(cameras, self.device)
+        is_kept = have_one_size and not is_pinhole and LensRays.nbytes(cameras) <= MAX_RAY_BYTES
+        return LensRays(cameras, self.device) if is_kept else None
 
     def _corrected(self, camera: Camera, index: Int64[Tensor, "1"]) -> Camera:
         return camera if self.poses is None else self.poses.moved(camera, index)
