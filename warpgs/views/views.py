@@ -26,8 +26,12 @@ from .stacked_cameras import LensRays, StackedCameras
 from .view_cache import ViewCache
 from .view_reader import Slot, ViewReader
 
-MANY, SAMPLED = 1_000, 500
-"""Number of views above which steps that look at all of them look at some, and at how many of them."""
+LONG = 1_000
+"""Number of views above which the file of decoded ones is written while training runs, and progress is shown."""
+
+MANY, SAMPLED = 4_000, 1_000
+"""Number of views above which steps that look at all of them look at some, and at how many of them: only of videos are
+there so many, in which each part of the scene is seen in many frames."""
 
 MAX_RAY_BYTES = 1 << 30
 """Maximum memory of the rays of lenses on the device [bytes]; rays of more are found again in each step."""
@@ -167,7 +171,7 @@ class Views:
     @cached_property
     def glances(self) -> list[Glance]:
         """Each view at a glance: all frames are read once, by threads."""
-        indices = progress(range(len(self)), "looking at the views", quiet=len(self) <= MANY)
+        indices = progress(range(len(self)), "looking at the views", quiet=len(self) <= LONG)
         glances = ReadAhead(self._glance, self._setup).each(range(len(self)))
         return [glance for _, glance in zip(indices, glances, strict=True)]
 
@@ -176,7 +180,7 @@ class Views:
         if self.resident:
             pixels = self._at(index).map(Tensor.cpu)
         else:
-            pixels = self._reader.read_once(index, keep=len(self) <= MANY)
+            pixels = self._reader.read_once(index, keep=len(self) <= LONG)
         return glance_at(pixels, self.camera(index))
 
     @cached_property
