@@ -139,6 +139,11 @@ def test_objects_of_several_segments_keep_their_times(edits):
         with_objects(*of_later_segment(), edits)
 
 
+def test_lines_about_objects_of_several_segments_say_that_each_has_its_own(tmp_path):
+    _, notes = with_ids(with_objects(*of_later_segment(), Edits()), tmp_path)
+    assert notes[1:] == ["each segment of time has numbers of its own: name all that an object has"]
+
+
 def test_recoloured_gaussians_keep_how_colours_depend_on_the_direction(scene):
     """In an image: the colour from every side is a shade of the new one."""
     alone = edited(scene, Edits(objects="1", recolor=(("1", 0.3, 0.6, 0.3),)))

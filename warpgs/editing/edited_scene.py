@@ -88,6 +88,8 @@ def with_ids(scene: TrainedScene, folder: Path, edits: Edits = NOTHING) -> tuple
     if not isinstance(scene, ObjectScene):
         ids, note = stored_objects(scene, folder)
         scene, notes = with_objects(scene, with_boxes(ids, scene, ()), NOTHING), [note] if note else []
+    if scene.scene.num_segments > 1:
+        notes.append("each segment of time has numbers of its own: name all that an object has")
     return scene, [f"objects: {with_boxes(scene.of_dynamic, scene, edits.box)}", *notes]
 
 
