@@ -158,6 +158,15 @@ def test_positional_arguments_have_names(command, metavars, capsys):
             ["train", "--model.appearance-size", "4"],
             "warpgs train: --model.appearance-size needs 2 values, INT INT; got 4\n",
         ),
+        (
+            ["train", "--background", "blue"],
+            "warpgs train: error parsing --background: expected auto, sky, mean, capture, black, white or FLOAT FLOAT "
+            "FLOAT, got 'blue'\n",
+        ),
+        (
+            ["import", "a", "b", "--holdout-camera", "right"],
+            "warpgs import: error parsing --holdout-camera: no value is written as 'right'\n",
+        ),
         (["train", "--no-dap"], "warpgs train: there is no option --no-dap any more: --omit dap omits it\n"),
         (
             ["render", "r", "--freeze", "1", "abc"],

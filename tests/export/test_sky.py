@@ -79,10 +79,11 @@ def test_usd_has_the_sky_as_a_dome_light_in_the_axes_of_its_files(under_sky, fin
 
 def test_the_summary_says_which_formats_hold_the_sky(under_sky, finished_run, tmp_path, monkeypatch):
     monkeypatch.setattr(Job, "clouds", under_sky)
-    for name in ("ply", "glb", "usd"):
+    for name in ("ply", "glb", "usd", "html"):
         if name == "usd":
             pytest.importorskip("pxr.UsdVol", reason="usd-core is not installed (extra 'export')")
         summary = export_run(Export(finished_run, format=name, out=tmp_path / name, quiet=True))
         note = f"--format {name} holds no sky, which was behind the Gaussians in training: only usd and html do"
-        assert (note in summary) == (name != "usd")
+        assert (note in summary) == (name not in ("usd", "html"))
+        assert ("with its sky" in summary) == (name in ("usd", "html"))
         assert "behind the Gaussians was #" not in summary

@@ -115,5 +115,5 @@ def _newest(run):
 def test_more_segments_than_times_are_refused(data):
     capture = tiny.trainer(data, data, tiny.CONFIG).capture
     config = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, segments=7))
-    with pytest.raises(ValueError, match="model.segments 7: expected at most the 6 times of training frames"):
+    with pytest.raises(ValueError, match=r"model\.segments 7: expected at most the 6 times of training frames"):
         make_plan(config, capture)

@@ -84,6 +84,11 @@ REWORDED: tuple[tuple[str, str | Callable[[re.Match[str]], str]], ...] = (
     (r"Could not parse arguments \[(.*)\] into tuple type tuple\[(.*)\]", _of_types),
     (r"^Missing value for argument '(\S+?)'.*", r"missing value for \1"),
     (
+        r"no type matching \{([^{}A-Z]+)\}\|\{([A-Z ]+)\} could be instantiated from \[(.*?)\]\..*",
+        lambda match: f"expected {', '.join(match[1].replace(',', ' ').split())} or {match[2]}, got {match[3]}",
+    ),
+    (r"Could not find valid parse for arguments: \[(.*)\]", r"no value is written as \1"),
+    (
         r"no type matching \{None\}\|\{?([A-Z ]+?)\}? could be instantiated from \[(.*?)\]\..*",
         r"expected \1, got \2",
     ),

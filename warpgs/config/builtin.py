@@ -69,7 +69,10 @@ def parse_builtin(data: Path | str) -> Builtin:
     if not is_known:
         # Without the prefix, which would make all names similar.
         close = suggestion(given, [name.removeprefix(PREFIX) for name in NAMES], f"{PREFIX}{{}}".format)
-        raise ValueError(f"there is no built-in capture {data}, expected one of {', '.join(NAMES)}{close}")
+        parts = {f"{PREFIX}{of}": f" (?{'=, '.join(queries)}=)" for of, queries in QUERIES.items()}
+        known = [f"{name}{parts.get(name, '')}" for name in NAMES if "?" not in name]
+        expected = f"expected one of {', '.join(known)}, joined by &"
+        raise ValueError(f"there is no built-in capture {data}, {expected}{close}")
     most = RIG_FRAMES if name == "rig" else MAX_FRAMES
     return Builtin(
         name,

@@ -216,7 +216,8 @@ def _write(job: Job) -> str:
     write_png(picture_path(path), picture(scene, start))
     count = f"{len(baked.static):,} static and {len(baked.dynamic):,} dynamic Gaussians at {baked.keys} key times"
     shared = f"{picture_path(path).name}: its picture where its address is shared"
-    return f"{path}: {count}, {size / 1e6:.1f} MB\n{shared}\nviews and camera path: {job.capture_note}"
+    sky = "" if dome is None else ", with its sky"
+    return f"{path}: {count}, {size / 1e6:.1f} MB{sky}\n{shared}\nviews and camera path: {job.capture_note}"
 
 
 OPTIONS = ("keys", "seconds", "max_megabytes", "precision", "title", "url")

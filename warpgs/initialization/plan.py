@@ -56,7 +56,9 @@ def _num_segments(model: ModelConfig, num_times: int) -> int:
     """Number of segments: what is asked for, or what suits the number of times."""
     if model.deformation == "mlp":
         if (model.segments or 1) > num_times:
-            raise ValueError(f"model.segments {model.segments}: expected at most the {num_times} times of training frames")
+            raise ValueError(
+                f"model.segments {model.segments}: expected at most the {num_times} times of training frames"
+            )
         return default_number(num_times) if model.segments is None else model.segments
     if model.segments not in (None, 1):
         raise ValueError(f'model.segments {model.segments} needs model.deformation "mlp", got "{model.deformation}"')
