@@ -4,7 +4,7 @@
 
 One hand-held camera trains, a second one beside it evaluates twice a second. The blob is always there, the ring leaves
 for a third of each minute, and every 13 seconds a visitor of other colours crosses the table in ten. No motion repeats.
-Ray-traced on a GPU where there is one, else by all cores; the bits depend on the machine.
+Ray-traced by several processes, on a GPU where there is one; the bits depend on the machine.
 """
 
 import argparse
@@ -12,7 +12,7 @@ import dataclasses
 import math
 import multiprocessing
 import os
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,9 @@ EVERY, STAY = 13.0, 10.0
 
 VAL_RATE = 2.0
 """Evaluation frames per second."""
+
+MAX_PROCESSES = 16
+"""Maximum number of processes, each of which traces and writes frames; on a GPU, too."""
 
 
 def _away(t: float) -> float:
@@ -74,12 +77,14 @@ def _trace(t: float, shift: float, size: studio.StudioSize, device: torch.device
 
 
 def _write(
-    folder: Path, frame: tuple[str, int, float], rate: float, size: studio.StudioSize, *found: np.ndarray
+    folder: Path, frame: tuple[str, int, float], rate: float, size: studio.StudioSize, device: torch.device
 ) -> np.ndarray:
-    """Writes a frame of which image, depth and static mask were found; returns its sparse points."""
-    (name, k, shift), (image, depth, static) = frame, found
+    """Writes a frame: its name, its number, and how far the camera is beside the one that trains; returns points."""
+    name, k, shift = frame
+    traced, num_static = _trace(k / rate, shift, size, device)
+    depth, static = traced.depth.cpu().numpy(), (traced.bodies < num_static).cpu().numpy()
     rotation, position = studio._pose(k / rate / PERIODS[0], shift)
-    writer.write_image(folder, name, image)
+    writer.write_image(folder, name, to_bytes(traced.image))
     writer.write_mask(folder, name, static)
     writer.write_camera(folder, name, studio.lens_of(size), rotation.round(9), position.round(9))
     if shift:
@@ -90,16 +95,12 @@ def _write(
     return studio.surface_points(inverse, static, studio.lens_of(size), (rotation, position), count, k)
 
 
-def _trace_and_write(folder: Path, frame: tuple[str, int, float], rate: float, size: studio.StudioSize) -> np.ndarray:
-    return _write(folder, frame, rate, size, *_arrays(frame, rate, size, torch.device("cpu")))
-
-
-def _arrays(
-    frame: tuple[str, int, float], rate: float, size: studio.StudioSize, device: torch.device
-) -> tuple[np.ndarray, ...]:
-    traced, num_static = _trace(frame[1] / rate, frame[2], size, device)
-    depth, static = traced.depth.cpu().numpy(), (traced.bodies < num_static).cpu().numpy()
-    return to_bytes(traced.image), depth, static
+def _write_part(
+    folder: Path, frames: list[tuple[str, int, float]], rate: float, size: studio.StudioSize
+) -> list[np.ndarray]:
+    torch.set_num_threads(1)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return [_write(folder, frame, rate, size, device) for frame in frames]
 
 
 def write_long(folder: Path, seconds: float, rate: float, size: studio.StudioSize) -> None:
@@ -108,17 +109,10 @@ def write_long(folder: Path, seconds: float, rate: float, size: studio.StudioSiz
     every = max(1, round(rate / VAL_RATE))
     frames = [(f"left_{k:06d}", k, 0.0) for k in range(size.num_frames)]
     frames += [(f"right_{k:06d}", k, studio.BASELINE) for k in range(every // 2, size.num_frames, every)]
-    has_gpu = torch.cuda.is_available()
-    jobs: list[Future[np.ndarray]] = []
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(os.cpu_count(), context, torch.set_num_threads, (1,)) as pool:
-        for frame in frames:
-            if has_gpu:
-                arrays = _arrays(frame, rate, size, torch.device("cuda"))
-                jobs.append(pool.submit(_write, folder, frame, rate, size, *arrays))
-            else:
-                jobs.append(pool.submit(_trace_and_write, folder, frame, rate, size))
-        points = [job.result() for job in jobs]
+    num = min(MAX_PROCESSES, os.cpu_count() or 1)
+    with ProcessPoolExecutor(num, multiprocessing.get_context("spawn")) as pool:
+        jobs = [pool.submit(_write_part, folder, frames[k::num], rate, size) for k in range(num)]
+        points = [part for job in jobs for part in job.result()]
     writer.write_scene(folder, SceneUnits(np.array(studio.CENTER), studio.SCALE), np.concatenate(points), 0.05, 3.0)
     val = [name for name, _, shift in frames if shift]
     ids = {name: int(shift > 0) for name, _, shift in frames}
