@@ -373,7 +373,7 @@ def test_data_replaces_the_folder_of_the_capture(stranded, data, tmp_path):
         ({"out": Path("a.ply"), "frames": 2}, "--frames writes several files: --out must be a folder, not a file as a"),
         ({"out": Path("a.ply"), "layers": "apart"}, "--layers apart writes several files: --out must be a folder"),
         ({"editing": Editing(Edits(max_gaussians=0))}, "--max-gaussians must be at least 1"),
-        ({"format": "html", "url": "a.org"}, "--url must be an address such as .*, got 'a.org'"),
+        ({"format": "html", "url": "a.org"}, "--url must be the address of a folder, such as .*, got 'a.org'"),
         ({"title": "a"}, "--title is for --format html, not for ply"),
         ({"format": "html", "max_megabytes": -1.0}, "--max-megabytes must be positive"),
         ({"format": "html", "max_megabytes": 0.001}, r"the page would hold .* use about --max-gaussians \d+"),
