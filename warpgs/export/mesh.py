@@ -176,7 +176,7 @@ class _Maker:
         return max(fitting_blocks(views, limit, self._voxel)[0] for views in seen or samples)
 
     def _mesh(self, views: Sequence[DepthView], voxel: float) -> Mesh:
-        # Only a size that the user chose is refused, at times that are no samples, too.
+        # Only a size that the user chose is refused, also at times between the samples.
         fitting = coarsened_blocks if self._voxel is None else fitting_blocks
         voxel, blocks = fitting(views, MAX_VOXELS, voxel)
         return mesh_of(fuse(views, voxel, blocks), views).rotated(self._rotation)

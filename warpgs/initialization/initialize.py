@@ -36,7 +36,7 @@ place. A Gaussian as small as the error between the scans would be culled and pr
 def initial_scene(config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator) -> SplitScene:
     """Static Gaussians at the sparse points (at random ones in the scene's box if there are none), no dynamic ones yet.
 
-    If everything is assumed to be dynamic, there are no static Gaussians either. There are none in the sky.
+    If everything is assumed to be dynamic, there are no static Gaussians either. The sky gets none.
     """
     dome = None
     if config.background == "sky":
