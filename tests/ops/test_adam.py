@@ -5,7 +5,9 @@ import torch
 
 from tests.reference.adam import adam as reference
 from tests.scenes import generator, relative_error
+from warpgs.kernels.adam import BLOCK, MAX_PARAMETERS, PER_THREAD
 from warpgs.ops.adam import Adam
+from warpgs.runtime.profiling import profile
 
 
 @pytest.fixture(autouse=True, params=["torch", "kernel"])
@@ -101,3 +103,37 @@ def test_parameters_may_have_any_shape_and_gradients_any_strides(gradient):
     parameter.grad = gradient
     optimizer.step()
     assert torch.allclose(parameter.detach(), -0.5 * gradient.sign(), rtol=1e-6)
+
+
+SIZES = [0, 1, 7, BLOCK, BLOCK * PER_THREAD + 1, 3 * BLOCK * PER_THREAD - 5, *[3] * MAX_PARAMETERS]
+
+
+def test_parameters_that_share_a_launch_are_updated_as_alone():
+    """Whatever their number and sizes; a step may be the first one of some."""
+    ours = [torch.randn(size, generator=generator(size)).requires_grad_() for size in SIZES]
+    alone = [p.detach().clone().requires_grad_() for p in ours]
+    rates = [torch.tensor(0.01 * k) for k in range(len(SIZES))]
+    together = Adam([{"params": [p], "lr": r} for p, r in zip(ours, rates, strict=True)], BETAS, EPSILON)
+    others = [Adam([{"params": [p], "lr": r}], BETAS, EPSILON) for p, r in zip(alone, rates, strict=True)]
+    for step in range(3):
+        for k, (a, b) in enumerate(zip(ours, alone, strict=True)):
+            a.grad = None if step == 0 and k % 3 == 0 else torch.randn(len(a), generator=generator(100 * step + k))
+            b.grad = None if a.grad is None else a.grad.clone()
+        for optimizer in (together, *others):
+            optimizer.step()
+    for a, b, optimizer in zip(ours, alone, others, strict=True):
+        assert torch.equal(a, b)
+        for name in ("step", "exp_avg", "exp_avg_sq"):
+            assert torch.equal(together.state[a][name], optimizer.state[b][name])
+
+
+@pytest.mark.parametrize(("num", "launches"), [(1, 2), (MAX_PARAMETERS, 2), (MAX_PARAMETERS + 1, 4)])
+def test_launches_do_not_become_more_with_each_parameter(num, launches):
+    params = [torch.ones(5, requires_grad=True) for _ in range(num)]
+    optimizer = Adam([{"params": params, "lr": torch.tensor(0.1)}], BETAS, EPSILON)
+    for parameter in params:
+        parameter.grad = torch.ones_like(parameter)
+    with profile() as profiled, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Adam, "_step_on_cpu", Adam._launch)
+        optimizer.step()
+    assert len(profiled.times()) == launches

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.scenes import as_leaves, generator, gradients, make_camera, make_splats
+from warpgs.kernels.adam import MAX_PARAMETERS, adam_begin
 from warpgs.kernels.mlp import make_layer_bwd
 from warpgs.kernels.projection import make_project_fwd
 from warpgs.ops.rows import new_order, new_rows
@@ -53,6 +54,19 @@ def test_a_wrong_number_of_arguments_is_refused():
     launching.launch(make_layer_bwd(False), 1, *matrices, torch.zeros(1, 8))
     with pytest.raises(ValueError, match="shorter"):
         launching.launch(make_layer_bwd(False), 1, *matrices)
+
+
+def test_an_argument_may_be_a_vector():
+    """Here of addresses, whose second launch differs from the first one in them alone."""
+    for expected in (torch.tensor([3.0]), torch.tensor([7.0])):
+        step, none = expected - 1.0, (0,) * (MAX_PARAMETERS - 1)
+        table = torch.zeros(1, 4, dtype=torch.int64), torch.zeros(1, 2, dtype=torch.int32), torch.zeros(1, 3)
+        addresses = [(tensor.data_ptr(), *none) for tensor in (*[torch.zeros(5)] * 4, expected, step)]
+        launching.launch(adam_begin, 1, *table, *addresses, (5, *none), (256, *none), -0.1, -0.1)
+        assert step == expected
+        assert table[0].tolist() == [[address[0] for address in addresses[:4]]]
+        assert table[1].tolist() == [[5, 256]]
+        assert table[2][0, 2] == expected
 
 
 def test_leading_axes_of_a_kernel_argument_are_flattened():

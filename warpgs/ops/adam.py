@@ -1,7 +1,9 @@
-"""Adam on the device: on CUDA in one kernel (kernels/adam.py), on CPU in torch's."""
+"""Adam on the device: on CUDA in two launches (kernels/adam.py), on CPU in torch's."""
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -12,7 +14,7 @@ from warpgs.runtime.launch import launch
 
 
 class Adam:
-    """Adam as ``torch.optim.Adam(fused=True, capturable=True)`` computes it, with one launch for each parameter.
+    """Adam as ``torch.optim.Adam(fused=True, capturable=True)`` computes it, with all parameters in one launch.
 
     Torch's CUDA kernel gives each block 65,536 numbers, so that the parameters of the Gaussians occupy only a few
     blocks. All state that changes between steps is on the device, so that a step can be part of a CUDA graph.
@@ -53,22 +55,35 @@ class Adam:
             self._step_on_cpu(trained)
 
     def _launch(self, trained: list[tuple[dict[str, Any], Any]]) -> None:
-        torch._foreach_add_([self.state[parameter]["step"] for _, parameter in trained], 1.0)
-        betas = [value for beta in self.betas for value in (beta, 1.0 - beta, math.log(beta))]
-        for group, parameter in trained:
-            state = self.state[parameter]
-            launch(
-                kernels.adam_step,
-                parameter.numel(),
-                parameter.grad.contiguous().view(-1),
-                group["lr"].view(1),
-                state["step"].view(1),
-                *betas,
-                self.epsilon,
-                parameter.view(-1),
-                state["exp_avg"].view(-1),
-                state["exp_avg_sq"].view(-1),
-            )
+        # Most threads are those of the largest parameters, and find these first.
+        trained = sorted(trained, key=lambda pair: pair[1].numel(), reverse=True)
+        for begin in range(0, len(trained), kernels.MAX_PARAMETERS):
+            self._launch_some(trained[begin : begin + kernels.MAX_PARAMETERS])
+
+    def _launch_some(self, trained: list[tuple[dict[str, Any], Any]]) -> None:
+        """At most ``MAX_PARAMETERS`` parameters."""
+        states = [self.state[parameter] for _, parameter in trained]
+        gradients = [parameter.grad.contiguous() for _, parameter in trained]
+        tensors = (
+            [parameter for _, parameter in trained],
+            gradients,
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
+            [group["lr"] for group, _ in trained],
+            [state["step"] for state in states],
+        )
+        sizes = [gradient.numel() for gradient in gradients]
+        blocks = [-(-size // (kernels.BLOCK * kernels.PER_THREAD)) for size in sizes]
+        ends = [kernels.BLOCK * end for end in accumulate(blocks)]
+        table = (
+            gradients[0].new_empty(len(trained), 4, dtype=torch.int64),
+            gradients[0].new_empty(len(trained), 2, dtype=torch.int32),
+            gradients[0].new_empty(len(trained), 3),
+        )
+        addresses = [_padded([tensor.data_ptr() for tensor in column]) for column in tensors]
+        (beta1, beta2), counts = self.betas, (_padded(sizes), _padded(ends))
+        launch(kernels.adam_begin, len(trained), *table, *addresses, *counts, math.log(beta1), math.log(beta2))
+        launch(kernels.adam_step, ends[-1], *table, beta1, 1.0 - beta1, beta2, 1.0 - beta2, self.epsilon)
 
     def _step_on_cpu(self, trained: list[tuple[dict[str, Any], Any]]) -> None:
         """Torch's kernel, which is vectorized, as Warp's on CPU is not."""
@@ -96,3 +111,8 @@ class Adam:
         for group in self.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None
+
+
+def _padded(numbers: Sequence[int]) -> tuple[int, ...]:
+    """The numbers of all parameters as an argument of a launch."""
+    return (*numbers, *[0] * (kernels.MAX_PARAMETERS - len(numbers)))

@@ -70,8 +70,9 @@ def launch(
     Args:
         kernel: Its first parameter is ``first``, the index of the first thread.
         dim: Number of threads.
-        arguments: Of the parameters after ``first``: contiguous tensors, the first argument among them, numbers, or
-            None for an empty array. More axes than an array of the kernel has are leading axes, which are flattened.
+        arguments: Of the parameters after ``first``: contiguous tensors, the first argument among them, numbers, tuples
+            for vectors of as many, or None for an empty array. More axes than an array of the kernel has are leading
+            axes, which are flattened.
         per_shard: The last arguments: tensors [``num_shards``, …] of which each CPU shard gets its own slice, because
             Warp's atomics are not atomic on CPU.
         block_dim: Threads per CUDA block.
@@ -150,7 +151,7 @@ class Command:
 
     def __init__(self, kernel: wp.Kernel, device: wp.Device, block_dim: int):
         kernel_cache.load(kernel, device, block_dim)
-        blank = [None if hasattr(a.type, "ndim") else 0 for a in kernel.adj.args]
+        blank = [_blank(a.type) for a in kernel.adj.args]
         self.launch = wp.launch(kernel, dim=1, inputs=blank, device=device, block_dim=block_dim, record_cmd=True)
         self.dim, self.first = 1, 0
         self.arguments = kernel.adj.args[1:]
@@ -166,7 +167,7 @@ class Command:
             self.launch.set_param_at_index_from_ctype(k + 1, array_type.from_buffer(memory, k * size))
 
     def __call__(self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None) -> None:
-        """Launches threads ``first`` to ``first + dim - 1``, with tensors, numbers or None (an empty array)."""
+        """Launches threads ``first`` to ``first + dim - 1``, with tensors, numbers, tuples or None."""
         if dim != self.dim:
             self.launch.set_dim(dim)
             self.dim = dim
@@ -192,8 +193,15 @@ class Command:
                 self.known[k] = None if value is None else value.shape
             elif isinstance(value, Tensor):
                 raise TypeError(f"kernel argument {argument.label} is a number, got a tensor")
+            elif isinstance(value, tuple):
+                slot[:] = self.known[k] = value
             else:
                 slot.value = self.known[k] = value
+
+
+def _blank(type: Any) -> Any:
+    """A value to record a launch with: no array, or zeros."""
+    return None if hasattr(type, "ndim") else type() if hasattr(type, "_shape_") else 0
 
 
 _UNKNOWN = object()
