@@ -6,7 +6,7 @@ import torch
 from tests.reference import mlp as reference
 from tests.scenes import error, generator, random_like, relative_error
 from warpgs.ops import mlp
-from warpgs.ops.mlp import layer_bwd, num_tiles, num_values, perceptron, split
+from warpgs.ops.mlp import ROWS_PER_PRODUCT, layer_bwd, num_tiles, num_values, perceptron, split
 
 COLUMNS, WIDTH, OUTPUTS = 6, 16, (3, 1, 1)
 LAYOUTS = [(9, 4), (4, 2), (4, 1), (5, 0), (2, 0)]
@@ -77,6 +77,47 @@ def test_padding_rows_change_neither_outputs_nor_gradients(half, num, monkeypatc
     for padded, expected in zip(*results, strict=True):
         assert padded.shape == expected.shape
         assert torch.allclose(padded, expected, rtol=0.0, atol=1e-5)
+
+
+def gradient_in_half_precision(num, shapes, skip):
+    """[values] gradient of all weights and biases."""
+    inputs = torch.randn(num, 8 + WIDTH, generator=generator()).half()
+    values = random_values(shapes)
+    outputs = torch.cat(perceptron(inputs, values, shapes, skip, OUTPUTS), 1)
+    outputs.backward(torch.randn(num, sum(OUTPUTS), generator=generator(2)))
+    return values.grad
+
+
+@pytest.mark.parametrize("num", [64, ROWS_PER_PRODUCT, ROWS_PER_PRODUCT + 128])
+@pytest.mark.parametrize("skip", [1, 3, 5])
+def test_stacked_layers_have_the_gradients_of_single_ones(skip, num, monkeypatch):
+    shapes = [(WIDTH, 8), *((WIDTH, WIDTH + 8 * (k == skip)) for k in range(1, 6)), (8, WIDTH)]
+    products = []
+
+    def count(*arguments):
+        products.append(arguments)
+        return single_precision_product(*arguments)
+
+    monkeypatch.setattr(mlp, "_product", count)
+    stacked = gradient_in_half_precision(num, shapes, skip)
+    num_stacked = len(products)
+    monkeypatch.setattr(mlp, "MAX_STACKED_ROWS", num - 1)
+    single = gradient_in_half_precision(num, shapes, skip)
+    assert relative_error(stacked, single) < 1e-6
+    num_runs = 2 if skip == 3 else 1
+    assert (num_stacked, len(products) - num_stacked) == (4 + num_runs, 8)
+
+
+def test_layers_are_not_stacked_without_gradients(monkeypatch):
+    monkeypatch.setattr(mlp, "_product", single_precision_product)
+    monkeypatch.setattr(mlp, "_new_stack", None)
+    shapes = [(WIDTH, 8), (WIDTH, WIDTH), (8, WIDTH)]
+    inputs, values = torch.zeros(64, 8).half(), random_values(shapes)
+    with torch.no_grad():
+        perceptron(inputs, values, shapes, 0, OUTPUTS)
+    perceptron(inputs, values.detach(), shapes, 0, OUTPUTS)
+    with pytest.raises(TypeError):
+        perceptron(inputs, values, shapes, 0, OUTPUTS)
 
 
 def test_outputs_that_are_not_used_have_no_gradient():

@@ -6,12 +6,13 @@ backward pass is g_k = (g_{k+1} W_k) · [h_k > 0]; the gradients of W_k and b_k 
 over its rows.
 
 All weights and biases are views of one tensor, and so are their gradients, so that an operation on all of them is one
-launch.
+launch. In half precision h_k and g_k of all layers are stacked, so that one batched product gives the gradients of all
+weights of equal shape. Products for each layer are too small for a GPU below some ten thousand rows.
 """
 
 import os
 from collections.abc import Sequence
-from itertools import chain
+from itertools import chain, groupby
 from typing import Any, NamedTuple
 
 import torch
@@ -23,7 +24,7 @@ from warpgs.kernels import mlp as kernels
 from warpgs.runtime.checks import check_same_device, check_tensor
 from warpgs.runtime.launch import launch
 
-from .encoding import ALIGNMENT, ROW_ALIGNMENT
+from .encoding import ALIGNMENT, ROW_ALIGNMENT, aligned
 
 MAX_GRADIENT = 1024.0
 """In half precision, gradients are scaled so that the largest one at the output has this magnitude: far enough below
@@ -38,6 +39,12 @@ be added up quickly."""
 
 ROWS_PER_CHUNK = 4
 """Minimum number of rows of such a partial sum."""
+
+ROWS_PER_PRODUCT = 1024
+"""Rows of a product in a batch, a multiple of ``ROW_ALIGNMENT``. A layer's products are added up afterwards."""
+
+MAX_STACKED_ROWS = 65_536
+"""Above this number of rows, layers are multiplied one after the other: gradients of all at once would need memory."""
 
 
 class Layer(NamedTuple):
@@ -98,6 +105,7 @@ def perceptron(
     if inputs.dtype == torch.float16:
         _check_sizes(len(inputs), num_rows, [inputs.shape[1], *chain(*shapes)])
         check_half_precision()
+    values = values if torch.is_grad_enabled() else values.detach()
     return _Perceptron.apply(inputs, values, tuple(shapes), skip, outputs, num_rows)
 
 
@@ -141,14 +149,16 @@ class _Perceptron(torch.autograd.Function):
         *hidden, head = split(copy, shapes)
         x = inputs[:, inputs.shape[1] - shapes[0][1] :]
         layer_inputs = []
+        stack = _new_stack(inputs, shapes) if ctx.needs_input_grad[1] else None
         for k, layer in enumerate(hidden):
             if skip and k == skip:
                 # Writing the product here directly would need two more passes, for the bias and for max.
                 _copy_columns(x, inputs)
                 x = inputs
             layer_inputs.append(x)
-            x = torch._addmm_activation(layer.bias, x, layer.weight.t())
-        ctx.save_for_backward(*layer_inputs, x, copy)
+            out = None if stack is None else stack[k, : len(x)]
+            x = torch._addmm_activation(layer.bias, x, layer.weight.t(), out=out)
+        ctx.save_for_backward(*layer_inputs, x, copy, stack)
         ctx.shapes = shapes
         product, bias = _product(x, head.weight.t())[:num_rows], split(values, shapes)[-1].bias
         used = slice(sum(outputs))
@@ -157,7 +167,7 @@ class _Perceptron(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        *layer_inputs, copy = ctx.saved_tensors
+        *layer_inputs, copy, stack = ctx.saved_tensors
         layers = split(copy, ctx.shapes)
         is_half = copy.dtype == torch.float16
         v_values = torch.empty_like(copy, dtype=torch.float32)
@@ -170,15 +180,20 @@ class _Perceptron(torch.autograd.Function):
             gradient = v_values.new_zeros(shape)
             torch.cat(gradients, 1, out=gradient[: len(gradients[0]), : sum(v.shape[1] for v in gradients)])
             torch.sum(gradient, 0, out=v_layers[-1].bias)
+        runs, v_stack = ([], None) if stack is None else (_square_runs(ctx.shapes), _new_stack(gradient, ctx.shapes))
         for k in reversed(range(len(layers))):
-            _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
+            if k not in chain(*runs):
+                _product(gradient.t(), layer_inputs[k], v_layers[k].weight)
             if k > 0 and is_half:
-                gradient = layer_bwd(gradient, layers[k].weight, layer_inputs[k], sums[k - 1])
+                out = None if v_stack is None else v_stack[k - 1, : len(gradient)]
+                gradient = layer_bwd(gradient, layers[k].weight, layer_inputs[k], sums[k - 1], out)
             elif k > 0:
                 gradient = torch.mm(gradient, layers[k].weight[:, : len(layers[k - 1].bias)])
                 features = layer_inputs[k][:, : gradient.shape[1]]
                 torch.ops.aten.threshold_backward(gradient, features, 0, grad_input=gradient)
                 torch.sum(gradient, 0, out=v_layers[k - 1].bias)
+        for run in runs:
+            _multiply_stacks(v_stack, stack, run, ctx.shapes, v_values)
         if is_half:
             v_biases = v_values[-shape[1] - sums.shape[0] * sums.shape[2] : -shape[1]]
             torch.sum(sums, 1, out=v_biases.view(sums.shape[0], sums.shape[2]))
@@ -206,6 +221,38 @@ def _scaled(gradients: Sequence[Tensor], shape: tuple[int, int]) -> tuple[Tensor
     return scaled, largest / MAX_GRADIENT, sums
 
 
+def _square_runs(shapes: Sequence[tuple[int, int]]) -> list[range]:
+    """The hidden layers whose inputs are all units of the one before, as ranges of consecutive ones."""
+    width = shapes[0][0]
+    runs = groupby(range(1, len(shapes) - 1), lambda k: shapes[k] == (width, width))
+    return [range(layers[0], layers[-1] + 1) for is_square, (*layers,) in runs if is_square]
+
+
+def _new_stack(inputs: Tensor, shapes: Sequence[tuple[int, int]]) -> Tensor | None:
+    """[hidden layers, rows, width] memory for the outputs of all hidden layers, or for their gradients.
+
+    Rows after those of ``inputs``, up to a multiple of ``ROWS_PER_PRODUCT``, are 0. None if layers are not stacked.
+    """
+    rows = len(inputs)
+    if inputs.dtype != torch.float16 or not 0 < rows <= MAX_STACKED_ROWS or not _square_runs(shapes):
+        return None
+    stack = inputs.new_empty(len(shapes) - 1, aligned(rows, ROWS_PER_PRODUCT), shapes[0][0])
+    stack[:, rows:] = 0.0
+    return stack
+
+
+def _multiply_stacks(
+    v_stack: Any, stack: Tensor, run: range, shapes: Sequence[tuple[int, int]], v_values: Tensor
+) -> None:
+    """Writes the gradients of the weights of consecutive square layers, from stacks of gradients and of features."""
+    width, num = stack.shape[2], len(run)
+    chunks = (-1, ROWS_PER_PRODUCT, width)
+    v_outputs, features = v_stack[run.start : run.stop].view(chunks), stack[run.start - 1 : run.stop - 1].view(chunks)
+    products = _product(v_outputs.transpose(1, 2), features).view(num, -1, width, width)
+    begin = sum(rows * columns for rows, columns in shapes[: run.start])
+    torch.sum(products, 1, out=v_values[begin : begin + num * width**2].view(num, width, width))
+
+
 def _copy_columns(source: Tensor, target: Tensor) -> None:
     """Copies ``source`` to the first columns of ``target``, in elements of 16 bytes if possible, which is faster."""
     if all(matrix.shape[1] * matrix.element_size() % 16 == 0 for matrix in (source, target)):
@@ -214,7 +261,9 @@ def _copy_columns(source: Tensor, target: Tensor) -> None:
 
 
 def _product(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
-    """The matrix product in single precision."""
+    """The matrix product in single precision, or those of a batch."""
+    if a.ndim == 3:
+        return torch.bmm(a, b, out_dtype=torch.float32)
     if a.dtype != torch.float16:
         return torch.mm(a, b, out=out)
     if out is None:
@@ -232,6 +281,7 @@ def layer_bwd(
     weight: Float16[Tensor, "outputs weight_columns"],
     features: Float16[Tensor, "N feature_columns"],
     sums: Float32[Tensor, "tiles columns"],
+    v_inputs: Float16[Tensor, "N columns"] | None = None,
 ) -> Float16[Tensor, "N columns"]:
     """Backward pass of a layer and of the ReLU before it. All numbers of columns are multiples of 8.
 
@@ -241,6 +291,7 @@ def layer_bwd(
         features: [N, ≥ columns] its inputs, the output of ReLU in the first columns.
         sums: [num_tiles(N), columns] output: partial sums of the result, whose sum over the first axis is the gradient
             of the bias before ReLU.
+        v_inputs: Memory for the result; new memory if None.
 
     Returns:
         [N, columns] gradient of the inputs of ReLU: v_outputs · weight, summed in single precision, and zero where
@@ -252,7 +303,9 @@ def layer_bwd(
             a multiple of 16 bytes.
     """
     _check_layer({"v_outputs": v_outputs, "weight": weight, "features": features}, sums)
-    v_inputs = v_outputs.new_empty(len(v_outputs), sums.shape[1])
+    if v_inputs is None:
+        v_inputs = v_outputs.new_empty(len(v_outputs), sums.shape[1])
+    check_tensor("v_inputs", v_inputs, (len(v_outputs), sums.shape[1]), {}, (torch.float16,))
     kernel = kernels.make_layer_bwd(v_outputs.is_cuda)
     threads = num_tiles(len(v_inputs)) * num_tiles(sums.shape[1]) * (kernels.BLOCK_DIM if v_outputs.is_cuda else 1)
     arguments = (v_outputs, weight, features, v_inputs, sums)
