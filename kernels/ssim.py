@@ -31,10 +31,14 @@ from .absolute import abs_derivative
 
 WINDOW = 11
 RADIUS = 5
+BLOCK_DIM, MIN_BLOCKS = 128, 4
+"""Threads of a CUDA block, and blocks per multiprocessor, so that a thread gets at most 128 registers. With as many as
+the compiler likes, few threads would be there to hide the latency of loads."""
+
 STRIP = 16
 """Pixels of one column per thread on CUDA; the lines above and below a strip are filtered once more."""
 
-SMALL_IMAGE_STRIP = 4
+SMALL_IMAGE_STRIP = 6
 """``STRIP`` of small images on CUDA, which would otherwise have too few threads to keep a GPU busy."""
 
 C1 = wp.constant(0.01**2)
@@ -81,7 +85,7 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
     """Forward kernel, one thread for each strip, column and channel."""
     pixel = sample_masked if with_mask else sample
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, launch_bounds=(BLOCK_DIM, MIN_BLOCKS), module="unique")
     def ssim_fwd(
         first: int,
         image: wp.array3d[float],
@@ -106,14 +110,12 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
         bottom = wp.min(top + strip, height)
         pending_x = window_vector()
         pending_y = window_vector()
-        pending_xx = window_vector()
-        pending_yy = window_vector()
+        pending_squares = window_vector()
         pending_xy = window_vector()
         for line in range(top - RADIUS, bottom + RADIUS):
             sum_x = float(0.0)
             sum_y = float(0.0)
-            sum_xx = float(0.0)
-            sum_yy = float(0.0)
+            sum_squares = float(0.0)
             sum_xy = float(0.0)
             if line >= 0 and line < height:
                 for k in range(WINDOW):
@@ -122,21 +124,20 @@ def make_ssim_fwd(with_mask: bool) -> wp.Kernel:
                     tap = TAPS[k]
                     sum_x += tap * p
                     sum_y += tap * q
-                    sum_xx += tap * p * p
-                    sum_yy += tap * q * q
+                    sum_squares += tap * (p * p + q * q)
                     sum_xy += tap * p * q
             pending_x = shift_and_add(pending_x, sum_x)
             pending_y = shift_and_add(pending_y, sum_y)
-            pending_xx = shift_and_add(pending_xx, sum_xx)
-            pending_yy = shift_and_add(pending_yy, sum_yy)
+            pending_squares = shift_and_add(pending_squares, sum_squares)
             pending_xy = shift_and_add(pending_xy, sum_xy)
             y = line - RADIUS
             if y >= top:
                 mu_x = pending_x[0]
                 mu_y = pending_y[0]
-                luminance = mu_x * mu_x + mu_y * mu_y + C1
+                products = mu_x * mu_x + mu_y * mu_y
+                luminance = products + C1
                 # Rounding can make the variance of a flat window slightly negative; C2 keeps the quotient finite.
-                contrast = pending_xx[0] - mu_x * mu_x + pending_yy[0] - mu_y * mu_y + C2
+                contrast = pending_squares[0] - products + C2
                 cross_luminance = 2.0 * mu_x * mu_y + C1
                 cross_contrast = 2.0 * (pending_xy[0] - mu_x * mu_y) + C2
                 scale = 1.0 / (luminance * contrast)
@@ -160,7 +161,7 @@ def make_ssim_bwd(with_mask: bool) -> wp.Kernel:
     """Backward kernel, launched like the forward one."""
     pixel = sample_masked if with_mask else sample
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, launch_bounds=(BLOCK_DIM, MIN_BLOCKS), module="unique")
     def ssim_bwd(
         first: int,
         image: wp.array3d[float],

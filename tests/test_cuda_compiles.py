@@ -1,11 +1,13 @@
 """Every kernel compiles for CUDA, even on a machine without a GPU."""
 
 import importlib
+import re
 from pathlib import Path
 
 import pytest
 import warp as wp
 
+from warpgs.kernels import ssim
 from warpgs.kernels.compositing_bwd import make_composite_bwd
 from warpgs.kernels.compositing_fwd import make_composite_fwd
 from warpgs.kernels.encoding import make_encode
@@ -68,6 +70,14 @@ def test_the_projection_without_depth_compiles(make, tmp_path):
 @pytest.mark.parametrize("with_mask", [False, True])
 def test_ssim_compiles(make, with_mask, tmp_path):
     assert_compiles(make(with_mask).module, tmp_path)
+
+
+@pytest.mark.parametrize("make", [make_ssim_fwd, make_ssim_bwd])
+def test_threads_of_ssim_leave_registers_for_more_blocks(make, tmp_path):
+    wp.compile_aot_module(make(True).module, arch=90, module_dir=tmp_path, use_ptx=True)
+    (ptx,) = tmp_path.glob("*.ptx")
+    limits = re.findall(r"\.(maxntid|minnctapersm) (\d+)", ptx.read_text())
+    assert dict(limits) == {"maxntid": str(ssim.BLOCK_DIM), "minnctapersm": str(ssim.MIN_BLOCKS)}
 
 
 @pytest.mark.parametrize("make", [make_composite_fwd, make_composite_bwd])

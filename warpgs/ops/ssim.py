@@ -114,7 +114,8 @@ def _launch(kernel: Any, image: Tensor, target: Tensor, mask: Tensor | None, *ar
     H, W, C = image.shape
     strip = kernels.SMALL_IMAGE_STRIP if is_small((W, H)) else kernels.STRIP
     mask_bytes = None if mask is None else mask.view(torch.uint8)
-    launch(kernel, -(-H // strip) * W * C, image, target, mask_bytes, strip, *arguments, work=strip)
+    threads = -(-H // strip) * W * C
+    launch(kernel, threads, image, target, mask_bytes, strip, *arguments, block_dim=kernels.BLOCK_DIM, work=strip)
 
 
 def _check_inputs(image: Tensor, target: Tensor, mask: Tensor | None, mean: bool) -> None:
