@@ -98,23 +98,30 @@ def adam_step(
         k += 1
     start = (thread - begin) / BLOCK * (BLOCK * PER_THREAD) + thread % BLOCK
     size = counts[k, 0]
+    # Read once: the compiler must assume that stores change the tables.
+    parameters = addresses[k, 0]
+    gradients = addresses[k, 1]
+    means = addresses[k, 2]
+    squares = addresses[k, 3]
+    mean_factor = factors[k, 0]
+    square_factor = factors[k, 1]
+    rate = factors[k, 2]
     gradient = wp.vec4(0.0)
     parameter = wp.vec4(0.0)
     mean = wp.vec4(0.0)
     square = wp.vec4(0.0)
     for j in range(PER_THREAD):
         if start + j * BLOCK < size:
-            gradient[j] = load(addresses[k, 1], start + j * BLOCK)
-            parameter[j] = load(addresses[k, 0], start + j * BLOCK)
-            mean[j] = load(addresses[k, 2], start + j * BLOCK)
-            square[j] = load(addresses[k, 3], start + j * BLOCK)
+            gradient[j] = load(gradients, start + j * BLOCK)
+            parameter[j] = load(parameters, start + j * BLOCK)
+            mean[j] = load(means, start + j * BLOCK)
+            square[j] = load(squares, start + j * BLOCK)
     for j in range(PER_THREAD):
         if start + j * BLOCK < size:
             g = gradient[j]
             m = beta1 * mean[j] + one_minus_beta1 * g
             v = beta2 * square[j] + one_minus_beta2 * g * g
-            store(addresses[k, 2], start + j * BLOCK, m)
-            store(addresses[k, 3], start + j * BLOCK, v)
-            root = wp.sqrt(v / factors[k, 1])
-            p = parameter[j] - factors[k, 2] * (m / factors[k, 0]) / (root + epsilon)
-            store(addresses[k, 0], start + j * BLOCK, p)
+            root = wp.sqrt(v / square_factor)
+            store(means, start + j * BLOCK, m)
+            store(squares, start + j * BLOCK, v)
+            store(parameters, start + j * BLOCK, parameter[j] - rate * (m / mean_factor) / (root + epsilon))
