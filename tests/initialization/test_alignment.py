@@ -1,6 +1,7 @@
 """Depth is aligned with the sparse points, and trusted by its error there."""
 
 import dataclasses
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -9,7 +10,9 @@ import torch
 from tests import plain
 from tests.initialization.test_initialize import CAMERA, CONFIG, make_capture, views_of, with_frames
 from tests.scenes import HEIGHT, WIDTH, error, generator
+from warpgs.data import depth_alignment
 from warpgs.initialization import alignment, initialize
+from warpgs.views.views import Views
 
 
 def capture_of_grid(inverse_of):
@@ -97,6 +100,21 @@ def test_depth_that_a_smooth_factor_makes_no_better_stays():
     before = views[0].inverse_depth.clone()
     alignment.align_to_points(capture, views, smooth=True)
     assert torch.equal(views[0].inverse_depth.nan_to_num(-1.0), before.nan_to_num(-1.0))
+
+
+@pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
+def test_smooth_factors_are_found_and_used_in_threads(monkeypatch, resident_bytes):
+    capture = capture_of_grid(lambda depth, column: (1.0 + 0.1 * torch.sin(column / 16.0)) / depth)
+    threads, find = set(), depth_alignment.smooth_factor
+    seen = lambda *sources: threads.add(threading.get_ident()) or find(*sources)  # noqa: E731
+    monkeypatch.setattr(depth_alignment, "smooth_factor", seen)
+    views = Views(capture, torch.device("cpu"), resident_bytes)
+    plain = alignment.align_to_points(capture, views)
+    alignment.align_to_points(capture, views, smooth=True)
+    assert threads
+    assert threading.get_ident() not in threads
+    again = alignment.align_to_points(capture, views)
+    assert (again.errors[:, 0] < 0.5 * plain.errors[:, 0]).all()
 
 
 @pytest.mark.parametrize("source", ["points", "rendering"])

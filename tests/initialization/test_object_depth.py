@@ -424,6 +424,17 @@ def test_uncertain_depth_of_an_object_is_averaged_with_that_by_its_size(error):
     assert all(torch.allclose(v.inverse_depth[v.static_mask], torch.tensor(1.0 / WALL), rtol=1e-3) for v in views)
 
 
+@pytest.mark.parametrize("resident_bytes", [0, 1 << 30])
+def test_objects_are_moved_by_threads(monkeypatch, resident_bytes):
+    threads, set_factor = set(), Views.set_depth_factor
+    seen = lambda *sources: threads.add(threading.get_ident()) or set_factor(*sources)  # noqa: E731
+    monkeypatch.setattr(Views, "set_depth_factor", seen)
+    _, found, _ = filled(misplaced(MASKS), 0.05, resident_bytes)
+    assert threads
+    assert threading.get_ident() not in threads
+    assert found == pytest.approx(filled(misplaced(MASKS), 0.05)[1], rel=1e-6)
+
+
 def rim_of(static_mask: torch.Tensor, width: int) -> torch.Tensor:
     """Dynamic pixels at most ``width`` pixels from static ones."""
     near = torch.nn.functional.max_pool2d(static_mask[None, None].float(), 2 * width + 1, 1, width)[0, 0]

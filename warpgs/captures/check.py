@@ -11,6 +11,7 @@ from warpgs.config.builtin import is_builtin
 from warpgs.data.capture import Assumption, Capture
 from warpgs.data.dynamic_regions import DynamicCounts
 from warpgs.data.loaders import missing_capture
+from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.writer import REPORT
 from warpgs.files import read_json
 
@@ -96,7 +97,8 @@ def quick_findings(capture: Capture) -> list[Finding]:
     contents = {name: sample.look(name) for name in sample.names}
     findings = [*check_counts(capture)]
     if (masks := _masks(capture, contents)) and are_suspect([*masks.values()]):
-        masks = _masks(capture, {name: sample.look(name) for name in capture.train})
+        every = ReadAhead(sample.look).each(capture.train)
+        masks = _masks(capture, dict(zip(capture.train, every, strict=True)))
         motions = motions_of(sample.capture, sample.pairs)
         findings += [*_judge(capture, masks, motions), *check_motion(motions, capture.conventions.masks)]
     findings += [*check_points(sample.capture, sample.names), *check_depth(sample.capture, sample.names)]

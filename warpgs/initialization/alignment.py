@@ -1,6 +1,6 @@
 """The alignment of the views' depth to the scene, and how much it is trusted."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from warpgs.config import LossConfig, RenderSettings
 from warpgs.data import depth_alignment
 from warpgs.data.capture import Capture
+from warpgs.data.depth_alignment import PointSamples
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import DEFAULTS, render
 from warpgs.views.views import Views
@@ -94,13 +95,30 @@ def align_to_points(capture: Capture, views: Views, smooth: bool = False) -> Dep
         alignments[batch] = depth_alignment.align_to_points(samples, capture.metric_depth)
         for index, part in zip(batch, samples, strict=True):
             errors[index] = depth_alignment.relative_errors(part, alignments[index])
-            plain[index] = errors[index, 0]
-            if smooth and bool(errors[index].isfinite().all()) and not bool(depth_alignment.is_unusable(errors[index])):
-                factor, error = depth_alignment.smooth_factor(part, alignments[index])
-                if error < errors[index, 0]:
-                    views.set_depth_factor(index, alignments[index], factor)
-                    errors[index, 0] = error
+        plain[batch] = errors[batch, 0]
+        if smooth:
+            errors[batch, 0] = _smooth(views, dict(zip(batch, samples, strict=True)), alignments, errors)
     return DepthAlignment(alignments, errors, plain)
+
+
+def _smooth(
+    views: Views, samples: Mapping[int, PointSamples], alignments: Float[Tensor, "T 2"], errors: Float[Tensor, "T 2"]
+) -> Float[Tensor, " V"]:
+    """Changes the depth of views by a smooth factor where that helps, in threads; the errors of V views after that."""
+    chosen = list(samples)
+    is_smoothed = errors[chosen].isfinite().all(1) & ~depth_alignment.is_unusable(errors[chosen])
+    before = dict(zip(chosen, errors[chosen, 0].tolist(), strict=True))
+
+    def smoothed(index: int) -> float:
+        factor, error = depth_alignment.smooth_factor(samples[index], alignments[index])
+        if error >= before[index]:
+            return before[index]
+        views.set_depth_factor(index, alignments[index], factor)
+        return error
+
+    smoothable = [index for index, asked in zip(chosen, is_smoothed.tolist(), strict=True) if asked]
+    after = before | dict(zip(smoothable, views.in_threads(smoothed, smoothable), strict=True))
+    return errors.new_tensor([after[index] for index in chosen])
 
 
 @torch.no_grad()

@@ -45,11 +45,15 @@ def average_depths(
     Returns:
         The number of views in which objects were moved.
     """
-    aligned = set(alignments.isfinite().all(1).nonzero()[:, 0].tolist())
-    for index in aligned:
-        views.change_depth(index, without_rims)
+    aligned = alignments.isfinite().all(1).tolist()
     cameras = [capture.cameras[name] for name in capture.train]
-    depths = [_scaled_depth(*of) for of in zip(views, alignments, cameras, strict=True)]
+
+    def scaled_depth(index: int) -> Float[np.ndarray, "h w"]:
+        if aligned[index]:
+            views.change_depth(index, without_rims)
+        return _scaled_depth(views[index], alignments[index], cameras[index])
+
+    depths = list(views.in_threads(scaled_depth, range(len(views))))
     images: dict[int, Tensor] = {}
     whole = [item for item in objects if not item.is_mostly_cut]
     for item, sizes in see_objects(capture, views, whole, SeenObject.sizes):
@@ -57,12 +61,15 @@ def average_depths(
         times = {index: cameras[index].time for index in known}
         corrections = _corrections(sizes, known, times, 1.0 - weight)
         paint(images, views, item, {k: filled(len(item.pixels[k]), 1.0 / value) for k, value in corrections.items()})
-    found = {index: image for index, image in images.items() if index in aligned}
-    for index, factor in found.items():
-        static = views[index].static_mask.cpu()
-        resized = cv2.resize(factor.nan_to_num(1.0).numpy(), static.shape[::-1], interpolation=cv2.INTER_NEAREST)
-        views.set_depth_factor(index, alignments[index], torch.where(static, 1.0, torch.from_numpy(resized)))
-    return len(found)
+    chosen = [index for index in images if aligned[index]]
+    return len(list(views.in_threads(lambda k: _multiply(views, k, alignments[k], images[k]), chosen)))
+
+
+def _multiply(views: Views, index: int, alignment: Float[Tensor, "2"], factor: Float[Tensor, "h w"]) -> None:
+    """Multiplies a view's aligned inverse depth by a factor at dynamic pixels, where it is known."""
+    static = views[index].static_mask.cpu()
+    resized = cv2.resize(factor.nan_to_num(1.0).numpy(), static.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    views.set_depth_factor(index, alignment, torch.where(static, 1.0, torch.from_numpy(resized)))
 
 
 def without_rims(inverse_depth: Float[Tensor, "H W"], static_mask: Bool[Tensor, "H W"]) -> Float[Tensor, "H W"]:

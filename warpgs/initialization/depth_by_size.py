@@ -54,8 +54,9 @@ def paint(
         values: Values of its pixels by index of the frame.
     """
     for index, found in values.items():
-        shape = scaled_size(views.camera(index))[::-1]
-        image = images.setdefault(index, torch.full(shape, torch.nan, dtype=torch.float32)).view(-1)
+        if index not in images:
+            images[index] = torch.full(scaled_size(views.camera(index))[::-1], torch.nan, dtype=torch.float32)
+        image = images[index].view(-1)
         pixels = torch.from_numpy(item.pixels[index]).long()
         image[pixels] = torch.where(image[pixels].isnan(), found, image[pixels])
 

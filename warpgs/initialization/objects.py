@@ -58,9 +58,13 @@ def find_objects(views: Views, order: Sequence[int]) -> list[MovingObject]:
         views: The training views.
         order: Indices of those of one camera, by time or backward in time.
     """
-    follower = _Follower(views)
-    for index in order:
-        follower.add(index)
+    follower, glances = _Follower(views), views.glances
+
+    def regions_of(index: int) -> list[Bool[np.ndarray, "h w"]]:
+        return dynamic_regions(glances[index].static_mask, views.camera(index))
+
+    for index, regions in zip(order, views.in_threads(regions_of, order), strict=True):
+        follower.add(index, regions)
     return follower.objects
 
 
@@ -97,11 +101,9 @@ class _Follower:
         self._before: int | None = None
         self._labels: Int[np.ndarray, "h w"] | None = None
 
-    def add(self, index: int) -> None:
-        """Goes on to the training frame of an index."""
-        camera = self._views.camera(index)
-        regions, alone = dynamic_regions(self._views.glances[index].static_mask, camera), set()
-        labels = np.full(scaled_size(camera)[::-1], NOTHING)
+    def add(self, index: int, regions: list[Bool[np.ndarray, "h w"]]) -> None:
+        """Goes on to the training frame of an index, which shows these regions."""
+        alone, labels = set(), np.full(scaled_size(self._views.camera(index))[::-1], NOTHING)
         for region, candidates in zip(regions, self._candidates(regions), strict=True):
             if len(candidates) > 1 and not any(self.objects[k].is_mixture for k in candidates):
                 self._divide(region, candidates, index, labels)

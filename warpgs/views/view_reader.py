@@ -52,7 +52,8 @@ class ViewReader:
     def change_depth(self, index: int, change: Change) -> None:
         """Replaces the inverse depth of a view by a function of it and of the mask, in the cache if that has space.
 
-        Called by one thread at a time. Others may read meanwhile: what they begin to read afterwards has the new depth.
+        Called by one thread at a time for each view. Others may read meanwhile: what they begin to read afterwards has
+        the new depth.
         """
         pixels, version = self._pixels(index, keep=False)
         pixels = _with_depth(pixels, change)

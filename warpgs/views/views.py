@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import chain
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ from .pixels import BYTES_PER_PIXEL, Pixels
 from .stacked_cameras import LensRays, StackedCameras
 from .view_cache import ViewCache
 from .view_reader import Slot, ViewReader
+
+Result = TypeVar("Result")
 
 LONG = 1_000
 """Number of views above which the file of decoded ones is written while training runs, and progress is shown."""
@@ -168,12 +170,15 @@ class Views:
             self.select(index)
             yield graphs.run("view", lambda: work(self.selected())) if graphs else work(self.selected())
 
+    def in_threads(self, work: Callable[[int], Result], indices: Sequence[int]) -> Iterator[Result]:
+        """The results of work on views of these indices, one after the other; it may change the depth of its view."""
+        return ReadAhead(work, self._setup).each(indices)
+
     @cached_property
     def glances(self) -> list[Glance]:
         """Each view at a glance: all frames are read once, by threads."""
         indices = progress(range(len(self)), "looking at the views", quiet=len(self) <= LONG)
-        glances = ReadAhead(self._glance, self._setup).each(range(len(self)))
-        return [glance for _, glance in zip(indices, glances, strict=True)]
+        return [glance for _, glance in zip(indices, self.in_threads(self._glance, range(len(self))), strict=True)]
 
     def _glance(self, index: int) -> Glance:
         # A large file is written while training runs, and not before it.
