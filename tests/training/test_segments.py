@@ -1,6 +1,7 @@
 """Training with several segments of time."""
 
 import dataclasses
+from unittest.mock import MagicMock, Mock
 
 import pytest
 import torch
@@ -10,8 +11,11 @@ from warpgs.initialization.plan import make_plan
 from warpgs.model.segments import nearest, window
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
+from warpgs.runs.logger import TrainingLogger
 from warpgs.runs.run import Run
 from warpgs.runtime import ranks
+from warpgs.training.density import gradient
+from warpgs.views.views import Views
 
 pytestmark = pytest.mark.usefixtures("quickly")
 
@@ -71,7 +75,7 @@ def test_ranks_leave_segments_where_cuda_graphs_read_them_unless_gaussians_are_r
     for name, value in (others | dict.fromkeys(("add_", "copy_first_"), lambda *tensors: None)).items():
         monkeypatch.setattr(ranks, name, value)
     monkeypatch.setattr(trainer.step.density, "merge", lambda: None)
-    monkeypatch.setattr(trainer.step, "begin_density", lambda: None)
+    monkeypatch.setattr(trainer.step, "begin_density", lambda num_kept: None)
     before = trainer.scene.dynamic.segments
     trainer._adapt(tiny.plan_to(trainer, action), None)
     assert (trainer.scene.dynamic.segments is not before) == replaced
@@ -117,3 +121,38 @@ def test_more_segments_than_times_are_refused(data):
     config = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, segments=7))
     with pytest.raises(ValueError, match=r"model\.segments 7: expected at most the 6 times of training frames"):
         make_plan(config, capture)
+
+
+def test_dynamic_gaussians_densify_when_each_segment_was_seen_as_often_as_a_capture(data, tmp_path, monkeypatch):
+    """The static ones densify after every 4 iterations, after 9, 13 and 17, the dynamic ones after 13 alone."""
+    trainer, done, views, densify = (
+        tiny.trainer(data, tmp_path, CONFIG),
+        {"static": [], "dynamic": []},
+        [],
+        gradient.densify,
+    )
+
+    def seen(gaussians, *others):
+        is_dynamic = gaussians is trainer.scene.dynamic
+        done["dynamic" if is_dynamic else "static"].append(trainer.iteration)
+        if is_dynamic:
+            counts = trainer.step.density.count[-len(gaussians) :]
+            views.append(sum(int(counts[gaussians.segments == k].max()) for k in range(2)))
+        densify(gaussians, *others)
+
+    monkeypatch.setattr(gradient, "densify", seen)
+    assert tiny.train(trainer)
+    assert done == {"static": [9, 13, 17], "dynamic": [13]}
+    assert views[0] > 4  # also those before static Gaussians were replaced
+
+
+def test_an_image_has_room_for_the_dynamic_gaussians_of_its_segment(data, tmp_path):
+    config = dataclasses.replace(CONFIG, densify=dataclasses.replace(CONFIG.densify, max_gaussians=10**6, min_pixels=8))
+    trainer = tiny.trainer(data, tmp_path, config)
+    trainer.iteration = trainer.protocol.stage1.start
+    trainer._add_dynamic_gaussians()
+    views = MagicMock(spec=Views, num_pixels=10_000 * 32 * 24)
+    views.__len__.return_value = 10_000
+    change = trainer._adaptation(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
+    capacity = dataclasses.replace(change, views=views).capacity
+    assert capacity == 3 * 32 * 24 - len(trainer.scene.static) - tiny.MODEL.dynamic_points

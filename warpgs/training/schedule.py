@@ -73,6 +73,8 @@ class IterationPlan(RatePlan):
         depth_weight: λ_depth(t) of paper Eq. 14; 0 = no depth loss.
         time_noise: Standard deviation of the noise on time, in frame intervals.
         done: Iterations of stage I and later that are done after this one; at most 0 before.
+        densifies_dynamic: Whether densification after this iteration includes the dynamic branch. Of K segments it does
+            every K-th time, when each has been seen as often as a capture of its own would.
         actions: What to do after the iteration, in this order.
     """
 
@@ -80,6 +82,7 @@ class IterationPlan(RatePlan):
     depth_weight: float
     time_noise: float
     done: int
+    densifies_dynamic: bool
     actions: tuple[Action, ...]
 
     @property
@@ -152,6 +155,7 @@ class Protocol:
     def at(self, iteration: int) -> IterationPlan:
         """The plan of an iteration."""
         phase, in_stage1 = self.phase_at(iteration), iteration - self.stage1.start
+        num = self.config.model.segments or 1
         progress = iteration / self.num_iterations
         decay = max(0.0, 1.0 - in_stage1 / max(1, self.config.schedule.noise_until))
         return IterationPlan(
@@ -164,6 +168,7 @@ class Protocol:
             depth_weight=self._depth_weight(progress) if phase.with_depth else 0.0,
             time_noise=NOISE * decay if in_stage1 >= 0 else 0.0,
             done=in_stage1 + 1,
+            densifies_dynamic=num == 1 or (in_stage1 + 1) % (num * self.config.densify.every) == 0,
             actions=self._actions(iteration),
         )
 

@@ -122,9 +122,15 @@ class Step:
         """Everything that is trained, by name: the scene and the corrections of the views' cameras."""
         return optim.trained_parameters(self.scene, self.views.poses)
 
-    def begin_density(self) -> None:
-        """Lets density control start anew and invalidates the graph; call it after the Gaussians were replaced."""
+    def begin_density(self, num_kept: int = 0) -> None:
+        """Lets density control start anew and invalidates the graph; call it after the Gaussians were replaced.
+
+        What was observed of the last ``num_kept`` of them, which were there before as the last ones, is kept.
+        """
+        observed = self.density.state() if num_kept else {}
         self.density.begin(len(self.scene.static) + len(self.scene.dynamic), self.views.device)
+        for name, values in observed.items():
+            self.density.state()[name][-num_kept:] = values[-num_kept:]
         if self.scene.num_segments > 1 and len(self.scene.dynamic):
             self.scene.rows()  # which a graph cannot read back from the device
         if self._graphs is not None:

@@ -146,6 +146,7 @@ class Trainer:
         """Lets rank 0 do what is planned after an iteration, and sends the result to the others."""
         ranks.any_rank(False)  # finds a lost rank
         self.step.density.merge()
+        before = self.scene.dynamic.means.data
         if ranks.is_first():
             if "realign" in plan.actions:
                 self._realign(plan.phase)
@@ -154,7 +155,9 @@ class Trainer:
         ranks.copy_first_(self.alignments)
         if plan.replaces_gaussians:  # otherwise CUDA graphs go on to read segments where they are
             self._copy_first_segments(self.scene)
-            self.step.begin_density()
+            dynamic = self.scene.dynamic
+            stays = self.scene.num_segments > 1 and dynamic.means.data_ptr() == before.data_ptr()
+            self.step.begin_density(num_kept=len(dynamic) * stays)
 
     def _realign(self, phase: Phase) -> None:
         """Aligns the depth of the views to the rendered depth, in place, because CUDA graphs read it."""

@@ -47,9 +47,15 @@ class Adaptation:
 
     @property
     def capacity(self) -> int:
-        """Number of Gaussians that may be added to both branches together; negative if there are too many."""
+        """Number of Gaussians that may be added to both branches together; negative if there are too many.
+
+        An image shows the dynamic Gaussians of its own segment alone.
+        """
         config, most = self.config.densify, self.config.densify.max_gaussians
-        if config.min_pixels:
-            pixels = self.views.num_pixels
-            most = min(most, pixels // config.min_pixels, MAX_PER_PIXEL * pixels // len(self.views))
-        return most - len(self.scene.static) - len(self.scene.dynamic)
+        num_static, num_dynamic = len(self.scene.static), len(self.scene.dynamic)
+        if not config.min_pixels:
+            return most - num_static - num_dynamic
+        pixels, segments = self.views.num_pixels, self.scene.dynamic.segments
+        num_shown = num_dynamic if segments is None or not num_dynamic else int(segments.bincount().max())
+        room = MAX_PER_PIXEL * pixels // len(self.views) - num_static - num_shown
+        return min(most - num_static - num_dynamic, pixels // config.min_pixels - num_static - num_dynamic, room)
