@@ -142,11 +142,15 @@ def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, est
 
 @pytest.mark.parametrize(("num", "rate"), [(8, 1e-4), (40, 5e-4), (80, 1e-3), (200, 1e-3)])
 def test_corrections_of_poses_are_slower_for_few_frames(num, rate):
-    cameras = {f"{k}": make_camera() for k in range(num)}
+    shift = torch.zeros(4, 4)
+    shift[0, 3] = 0.01
+    still = make_camera()
+    moving = {f"{k}": dataclasses.replace(still, viewmat=still.viewmat + k * shift) for k in range(num)}
+    cameras = moving | {f"{k} again": camera for k, camera in moving.items()}
     capture = Capture("shot", cameras, list(cameras), [], torch.zeros(0, 3), None, no_frame)
     plan, notes = make_plan(plain.config(optim=plain.optim(poses=1e-3)), capture)
     assert plan.optim.poses == pytest.approx(rate)
-    assert any(f"each of {num} frames" in note for note in notes) == (rate < 1e-3)
+    assert any(f"each of {num} poses" in note for note in notes) == (rate < 1e-3)
 
 
 def test_without_a_minimum_period_all_frequencies_are_used():

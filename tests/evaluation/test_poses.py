@@ -22,7 +22,7 @@ def image(splats, camera):
 
 @torch.no_grad()
 def test_a_camera_that_was_moved_finds_back():
-    splats, poses = make_splats(), PoseCorrections(1, 4.0)
+    splats, poses = make_splats(), PoseCorrections(torch.zeros(1, dtype=torch.int64), 4.0)
     poses.rotations += torch.tensor([0.01, -0.012, 0.008])
     poses.translations += torch.tensor([0.004, -0.003, 0.002])
     moved = dataclasses.replace(CAMERA, viewmat=poses(CAMERA.viewmat, torch.tensor([0])))

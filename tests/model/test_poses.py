@@ -1,12 +1,13 @@
 """Corrections of camera poses."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
 from tests.scenes import error, make_camera
-from warpgs.model.poses import PoseCorrections
+from warpgs.model.poses import PoseCorrections, shared_places
 
 VIEWMAT = make_camera().viewmat
 INDEX = torch.tensor([1])
@@ -14,7 +15,7 @@ INDEX = torch.tensor([1])
 
 def poses(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0), unit=5.0):
     """Corrections of three cameras; only the second one is moved."""
-    made = PoseCorrections(3, unit)
+    made = PoseCorrections(torch.arange(3), unit)
     with torch.no_grad():
         made.rotations[1], made.translations[1] = torch.tensor(rotation), torch.tensor(translation)
     return made
@@ -22,7 +23,7 @@ def poses(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0), unit=5.0):
 
 def test_cameras_stay_where_they_are_at_first():
     for index in range(3):
-        assert torch.equal(PoseCorrections(3, 5.0)(VIEWMAT, torch.tensor([index])), VIEWMAT)
+        assert torch.equal(PoseCorrections(torch.arange(3), 5.0)(VIEWMAT, torch.tensor([index])), VIEWMAT)
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -57,3 +58,16 @@ def test_only_the_chosen_camera_gets_a_gradient():
     for parameter in corrections.parameters():
         assert parameter.grad[1].abs().min() > 0.0
         assert not parameter.grad[[0, 2]].any()
+
+
+def test_frames_of_a_camera_that_stands_still_share_a_correction():
+    here, moved = make_camera(), dataclasses.replace(make_camera(), viewmat=VIEWMAT + 1e-6 * torch.eye(4))
+    turning = dataclasses.replace(here, motion=torch.full((2, 3), 0.01))
+    later = dataclasses.replace(here, time=0.9)
+    places = shared_places([here, moved, later, turning, moved])
+    assert places.tolist() == [0, 1, 0, 2, 1]
+    corrections = PoseCorrections(places, 5.0)
+    with torch.no_grad():
+        corrections.translations[1] = 0.1
+    shifted = [not torch.equal(corrections(VIEWMAT, torch.tensor([k])), VIEWMAT) for k in range(5)]
+    assert shifted == [False, True, False, False, True]

@@ -310,6 +310,35 @@ def test_frames_that_were_not_trained_on_keep_their_cameras(data, tmp_path, capt
     assert torch.equal(corrected.cameras[second].viewmat, expected)
 
 
+def change_tensors(path, change):
+    loaded = checkpoint.load(path)
+    tensors = dict(loaded.tensors)
+    change(tensors)
+    checkpoint.save(path, tensors, loaded.metadata)
+
+
+def test_checkpoints_without_places_have_a_correction_of_each_frame(data, tmp_path, capture):
+    run, trainer = run_with_poses(data, tmp_path / "run")
+
+    def spread(tensors):
+        places = tensors.pop("poses.places")
+        tensors |= {name: tensors[name][places] for name in ("poses.rotations", "poses.translations")}
+
+    change_tensors(run.newest_checkpoint(), spread)
+    corrected = run.open_corrected_capture(quiet=True)
+    for name, expected in zip(capture.train, trainer.views.cameras(), strict=True):
+        assert torch.equal(corrected.cameras[name].viewmat, expected.viewmat)
+
+
+@pytest.mark.parametrize("change", [lambda p: p - 1, lambda p: p + len(p), lambda p: p[1:], lambda p: p.float()])
+def test_damaged_places_are_refused(data, tmp_path, change):
+    run, trainer = run_with_poses(data, tmp_path / "run")
+    places = {"poses.places": change(trainer.views.poses.places)}
+    change_tensors(run.newest_checkpoint(), lambda tensors: tensors.update(places))
+    with pytest.raises(checkpoint.DamagedCheckpointError, match="expected poses"):
+        run.open_corrected_capture(quiet=True)
+
+
 def test_corrections_of_version_0_3_are_fractions_of_the_extent(data, tmp_path, capture):
     run, trainer = run_with_poses(data, tmp_path / "run")
     tiny.edit_metadata(run.newest_checkpoint(), lambda fields: fields.pop("unit"))

@@ -342,7 +342,7 @@ def test_the_margin_is_relative_to_the_larger_side(tmp_path):
 def test_corrections_move_the_cameras_of_views(capture, resident_bytes):
     if capture.frame(capture.train[0]).static_mask is None:
         capture = capture.assuming("static")
-    poses = PoseCorrections(len(capture.train), 2.0)
+    poses = PoseCorrections(torch.arange(len(capture.train)), 2.0)
     with torch.no_grad():
         poses.translations[1] = 0.25
     views = Views(capture, CPU, resident_bytes, poses=poses)

@@ -20,7 +20,8 @@ class OptimConfig:
     """Spherical harmonics of degree 0."""
     poses: float = 5e-5
     """Initial rate of the corrections of camera poses [rad, and fractions of the view size]; decays exponentially to
-    1 %. With fewer than 80 training frames, proportionally lower. 0: cameras stay as the capture has them (paper)."""
+    1 %. All frames of a camera that stands still share one; with fewer than 80, proportionally lower. 0: cameras stay
+    as the capture has them (paper)."""
     networks: Annotated[float, Bounds(positive=True)] = 8e-4
     """Initial rate of the networks (paper, training protocol)."""
     networks_end: Annotated[float, Bounds(positive=True)] = 1.6e-6

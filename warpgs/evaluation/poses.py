@@ -83,7 +83,8 @@ def aligned_camera(
         region: [H, W] the pixels that are compared; all if None.
     """
     device = camera.viewmat.device
-    poses, index = PoseCorrections(1, unit).to(device), torch.zeros(1, dtype=torch.int64, device=device)
+    index = torch.zeros(1, dtype=torch.int64, device=device)
+    poses = PoseCorrections(index, unit).to(device)
 
     def moved(pose: Float[Tensor, "6"]) -> Camera:
         poses.rotations.copy_(pose[None, :3])

@@ -8,14 +8,16 @@ import numpy as np
 from warpgs.config import Background, Color, ModelConfig, Plan, TrainConfig, scaled
 from warpgs.data.capture import COLORS, Capture, background_color
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.errors import counted
+from warpgs.model.poses import shared_places
 from warpgs.model.segments import OVERLAP, default_number
 from warpgs.runtime.devices import choose_device
 
 from .sky import find_sky
 
-MANY_FRAMES = 80
-"""Number of training frames from which on corrections of poses have their whole rate. Cameras of fewer are each seen
-more often: at the rate of 80 frames those of 14 are led away from where their held-out neighbours are."""
+MANY_POSES = 80
+"""Number of poses of training cameras from which on their corrections have the whole rate. Each of fewer is seen more
+often: at the rate of 80 those of 14 frames are led away from where their held-out neighbours are."""
 
 MAX_AVERAGED = 50
 """Maximum number of frames whose mean colour is the background."""
@@ -40,10 +42,10 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
     if bands < asked:
         notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} times determine no more")
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, time_bands=bands))
-    seen = len(capture.train)
-    poses = config.optim.poses * min(1.0, seen / MANY_FRAMES)
+    num_poses = int(shared_places([capture.cameras[name] for name in capture.train]).max()) + 1
+    poses = config.optim.poses * min(1.0, num_poses / MANY_POSES)
     if poses < config.optim.poses:
-        notes.append(f"corrections of poses learn at {poses:.1e}: each of {seen} frames is seen often")
+        notes.append(f"corrections of poses learn at {poses:.1e}: each of {counted(num_poses, 'pose')} is seen often")
         config = dataclasses.replace(config, optim=dataclasses.replace(config.optim, poses=poses))
     branches = loss.branches_in_stage2 != "no"
     if loss.branches_in_stage2 == "given-masks" and capture.assuming(config.assumption).uses_estimated_masks:

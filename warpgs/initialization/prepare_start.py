@@ -11,7 +11,7 @@ from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.data.empty_masks import wrongly_empty
 from warpgs.data.responses import camera_responses
 from warpgs.errors import command, counted
-from warpgs.model.poses import PoseCorrections
+from warpgs.model.poses import PoseCorrections, shared_places
 from warpgs.runtime import ranks
 from warpgs.views.views import Views
 
@@ -61,7 +61,10 @@ def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
     """The start before any remedy."""
     capture = capture.assuming(plan.assume).over(plan.background)
     num, device = len(capture.train), torch.device(plan.device)
-    poses = PoseCorrections(num, capture.view_size).to(device) if plan.optim.poses else None
+    poses = None
+    if plan.optim.poses:
+        places = shared_places([capture.cameras[name] for name in capture.train])
+        poses = PoseCorrections(places, capture.view_size).to(device)
     views = Views(capture, device, plan.resident_bytes, plan.loss.mask_margin, poses, plan.graph)
     start = Start(
         plan,

@@ -291,11 +291,15 @@ def load_poses(checkpoint: Checkpoint, unit: float) -> PoseCorrections:
         unit: Of ``PoseCorrections``; from ``unit_of`` [scene units].
 
     Raises:
-        DamagedCheckpointError: If they are missing, or not one for each training view.
+        DamagedCheckpointError: If they are missing, or there is not one for each training view.
     """
-    poses = PoseCorrections(len(checkpoint.metadata.views), unit)
-    state = poses.state_dict()
-    poses.load_state_dict({name: checkpoint.tensor(f"poses.{name}", t.shape) for name, t in state.items()})
+    num = len(checkpoint.metadata.views)
+    places = checkpoint.tensors.get("poses.places", torch.arange(num))  # until 0.3, one per view
+    if places.shape != (num,) or places.dtype != torch.int64 or not bool(((places >= 0) & (places < num)).all()):
+        raise DamagedCheckpointError(checkpoint.path, f"expected poses.places as {num} integers below {num}")
+    poses = PoseCorrections(places, unit)
+    for name, parameter in poses.named_parameters():
+        parameter.data.copy_(checkpoint.tensor(f"poses.{name}", parameter.shape))
     return poses
 
 
