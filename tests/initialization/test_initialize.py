@@ -583,3 +583,25 @@ def test_initial_gaussians_have_the_sh_degree_of_the_model(degree, assumption):
     scene = initial_scene(config, capture)
     for gaussians in (scene.static, scene.dynamic, dynamic_gaussians(capture, ALIGNMENT, config)):
         assert gaussians.sh.shape[1] == (degree + 1) ** 2
+
+
+def test_the_deformation_is_fitted_to_all_that_cameras_see_at_one_time(monkeypatch):
+    capture = make_capture(grid(0.5), inverse_depth=constant_depth())
+    times = {"0": 0.5, "1": 0.25, "2": 0.5}
+    cameras = {name: dataclasses.replace(CAMERA, time=time) for name, time in times.items()}
+    read = capture.frame
+    capture = dataclasses.replace(capture, cameras=cameras)
+    capture = with_frames(capture, lambda name: dataclasses.replace(read(name), camera=cameras[name]))
+    seen = []
+
+    def fit_motion(deformation, observed, *_):
+        seen.append(observed)
+        return motion_fit.MotionFit(observed.points, 0)
+
+    monkeypatch.setattr(initialize, "fit_motion", fit_motion)
+    schedule = dataclasses.replace(CONFIG.schedule, fit_motion=5)
+    start = dynamic_start(capture, ALIGNMENT, dataclasses.replace(CONFIG, schedule=schedule))
+    assert start.lacks_fit
+    assert seen[0].times.tolist() == [0.25, 0.5]
+    first, second = seen[0].points.views.bincount().tolist()
+    assert second == 2 * first > 0

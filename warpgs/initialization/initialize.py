@@ -134,20 +134,26 @@ def dynamic_gaussians(
     if not (config.schedule.fit_motion and found.depth_known):
         gaussians = _gaussians_at_dynamic_points(config, capture, found, generator)
         return DynamicStart(gaussians, lacks_fit=config.schedule.fit_motion > 0)
-    fit = fit_motion(deformation, _observed(capture, views, alignments, found), config, generator, is_stopped)
+    observed = _observed(capture, views, alignments, found)
+    fit = fit_motion(deformation, observed, config, generator, is_stopped)
     if fit is None:
         return None
     gaussians = _gaussians_at_dynamic_points(config, capture, fit.points, generator)
-    return DynamicStart(gaussians, fit.points is found, fit.num_tracks)
+    return DynamicStart(gaussians, fit.points is observed.points, fit.num_tracks)
 
 
 def _observed(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"], found: DynamicPoints) -> Observed:
-    """What a deformation is fitted to: points, and tracks if the capture has some on what moves."""
+    """What a deformation is fitted to: points, and tracks if the capture has some on what moves.
+
+    Without tracks, which are of one view each, the points of all views at one time are compared together: cameras
+    around an object show all of its sides.
+    """
     times = torch.tensor([capture.cameras[name].time for name in capture.train], dtype=torch.float32)
-    paths = None
     if capture.tracks is not None:
         paths = dynamic_paths(capture.tracks, list(capture.train), views, alignments)
-    return Observed(found, times, capture.view_size, paths)
+        return Observed(found, times, capture.view_size, paths)
+    moments, moment = times.unique(return_inverse=True)
+    return Observed(found._replace(views=moment[found.views]), moments, capture.view_size)
 
 
 def _gaussians_at_dynamic_points(

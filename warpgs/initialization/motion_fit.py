@@ -67,11 +67,11 @@ MIN_KEPT = 0.3
 
 
 class Observed(NamedTuple):
-    """What the T training views see of what moves.
+    """What T training views, or all training views at each of T times, see of what moves.
 
     Attributes:
         points: At least one point, all at known depth.
-        times: [T] times of the views in [0, 1].
+        times: [T] in [0, 1].
         view_size: Of the capture [scene units].
         paths: Tracks of a network; None without any.
     """
