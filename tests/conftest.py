@@ -4,13 +4,14 @@ from pathlib import Path
 
 import jaxtyping
 
-import tests.typechecks  # noqa: F401  # named below
+from tests import typechecks
 
 # The kernels lie outside this folder and are omitted: Warp reads their annotations itself.
 PACKAGE = Path(__file__).parent.parent / "warpgs"
 CHECKED = [
     f"warpgs.{path.stem}" for path in PACKAGE.iterdir() if path.stem not in ("__init__", "__pycache__", "kernels")
 ]
+jaxtyping.jaxtyped = typechecks.jaxtyped
 jaxtyping.install_import_hook(CHECKED, "tests.typechecks.check")
 
 import pytest  # noqa: E402
