@@ -1,6 +1,7 @@
 """Rules of the architecture, checked on the sources."""
 
 import ast
+import functools
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -61,11 +62,18 @@ def module_name(path: Path) -> list[str]:
     return parts if parts[0] == "warpgs" else ["warpgs", *parts]
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    """The syntax tree of a file."""
+    return ast.parse(path.read_text())
+
+
+@functools.cache
 def imports(path: Path) -> list[str]:
     """Absolute names of everything that a file imports."""
     package = module_name(path)[:-1]
     names = []
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -166,7 +174,7 @@ def test_no_file_is_long(path):
 
 @pytest.mark.parametrize("path", [p for p in FILES if "kernels" not in p.parts], ids=lambda p: str(p.relative_to(ROOT)))
 def test_no_function_is_long(path):
-    functions = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)]
+    functions = [n for n in ast.walk(parsed(path)) if isinstance(n, ast.FunctionDef)]
     assert [f.name for f in functions if f.end_lineno - f.lineno + 1 > MAX_FUNCTION_LINES] == []
 
 
@@ -178,7 +186,7 @@ def test_annotated_shapes_are_checked_while_tests_run():
 def defines_kernels(path: Path) -> bool:
     decorators = [
         ast.unparse(decorator)
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.FunctionDef)
         for decorator in node.decorator_list
     ]

@@ -54,9 +54,12 @@ def test_the_encoding_compiles(half, tmp_path):
     assert_compiles(make_encode(half).module, tmp_path)
 
 
+SHUTTERS = [(lens, (is_rolling,)) for lens in LENSES for is_rolling in (False, True)]
+SHUTTERS += [("pinhole", (True, True))]  # read by columns: of every lens, only the axis of the image is another
+
+
 @pytest.mark.parametrize("make", [make_project_fwd, make_project_bwd])
-@pytest.mark.parametrize("lens", LENSES)
-@pytest.mark.parametrize("shutter", [(False,), (True,), (True, True)])
+@pytest.mark.parametrize(("lens", "shutter"), SHUTTERS)
 def test_the_projection_compiles(make, lens, shutter, tmp_path):
     assert_compiles(make(3, True, lens, *shutter).module, tmp_path, ARCHS[:1])  # its code is the same for all
 

@@ -1,5 +1,5 @@
 """Fixtures of the tests of captures as a whole."""
 
-from tests.data.conftest import edited, root, with_boards, written
+from tests.data.conftest import edited, root, with_boards, without_motion, written
 
-__all__ = ["edited", "root", "with_boards", "written"]
+__all__ = ["edited", "root", "with_boards", "without_motion", "written"]

@@ -26,6 +26,8 @@ from warpgs.data.depth_alignment import sample_points
 from warpgs.data.dynamic_regions import unknown_depth
 from warpgs.views.view_reader import ViewReader
 
+WITHOUT_MOTION = pytest.mark.usefixtures("without_motion")
+
 
 @pytest.fixture
 def root(with_boards, tmp_path):
@@ -93,12 +95,14 @@ def write_masks(root, is_cut):
         cv2.imwrite(str(path), mask)
 
 
+@WITHOUT_MOTION
 @pytest.mark.parametrize(("num_cut", "warned"), [(4, False), (5, True), (16, True)])
 def test_unknown_depth_of_objects_that_the_border_cuts_off_in_too_many_frames_is_a_warning(root, num_cut, warned):
     write_masks(root, lambda k: k < num_cut)
     assert (unknown_depth(num_cut, 16) in texts(check_capture(root), "warning")) == warned
 
 
+@WITHOUT_MOTION
 @pytest.mark.parametrize("is_known", [False, True])
 def test_objects_that_the_border_cuts_off_are_no_warning_if_their_depth_is_known(root, is_known):
     write_masks(root, lambda k: True)
@@ -129,6 +133,7 @@ def test_missing_masks_are_an_error_that_says_how_to_make_them(root):
     assert "cameras" in {finding.topic for finding in report.findings}
 
 
+@WITHOUT_MOTION
 @pytest.mark.parametrize(
     ("masked", "text"),
     [
@@ -154,6 +159,7 @@ def test_training_frames_need_masks_and_evaluation_frames_do_not_as_in_training(
             views.read(k)
 
 
+@WITHOUT_MOTION
 def test_every_damaged_file_is_named(root):
     for name in ("shot003", "shot007"):
         path = root / f"rgb/1x/{name}.png"
@@ -196,6 +202,7 @@ def test_cameras_that_look_away_are_an_error_also_of_the_quick_check(root):
     assert [f.level for f in quick_findings(load_capture(root))] == ["error"]
 
 
+@WITHOUT_MOTION
 def test_points_at_the_cameras_are_a_warning(root):
     centers = [json.loads(p.read_text())["position"] for p in (root / "camera").iterdir()]
     points = np.load(root / "points.npy")
@@ -238,6 +245,7 @@ def check_metric(root, convert):
     return check_capture(root, "iphone", factor=1)
 
 
+@WITHOUT_MOTION
 def test_metric_depth_is_compared_as_it_is(root):
     assert "metric depth is 0.0% off" in texts(check_metric(root, lambda depth: depth), "note")
     report = check_metric(root, lambda depth: 2.0 * depth)  # a scale would hide it
@@ -247,22 +255,26 @@ def test_metric_depth_is_compared_as_it_is(root):
     )
 
 
+@WITHOUT_MOTION
 def test_metric_depth_without_points_to_compare_with_is_fit(root):
     report = check_metric(root, lambda depth: np.where(np.arange(256) == 5, depth, 0.0))  # 0 is unknown
     assert "cannot" not in str(report)
     assert "too few to align" not in str(report)
 
 
+@WITHOUT_MOTION
 def test_metric_depth_that_is_known_nowhere_is_a_warning(root):
     assert "is known nowhere" in texts(check_metric(root, np.zeros_like), "warning")
 
 
+@WITHOUT_MOTION
 def test_depth_instead_of_inverse_depth_is_a_warning(root):
     write_depth(root, lambda depth: depth)
     warnings = texts(check_capture(root), "warning")
     assert "the depth of 12 of 12 frames cannot be aligned to the points: it grows" in warnings
 
 
+@WITHOUT_MOTION
 @pytest.mark.parametrize(
     ("convert", "problem"),
     [
@@ -278,6 +290,7 @@ def test_problems_of_depth_are_told_apart(root, convert, problem):
     )
 
 
+@WITHOUT_MOTION
 def test_depth_that_is_known_nowhere_is_found_without_points(root):
     write_depth(root, lambda depth: np.full_like(depth, np.nan))
     (root / "points.npy").unlink()
@@ -332,6 +345,7 @@ def test_one_evaluation_frame_outside_of_the_training_frames_is_one(root):
     assert "1 evaluation frame lies before or after all training frames" in shown
 
 
+@WITHOUT_MOTION
 def test_depth_that_must_be_aligned_is_said_to_be_unused_without_points(root):
     write_depth(root, lambda depth: 1.0 / depth)
     (root / "points.npy").unlink()
@@ -343,6 +357,7 @@ def test_depth_that_must_be_aligned_is_said_to_be_unused_without_points(root):
     assert unused in [f.text for f in quick_findings(load_capture(root))]
 
 
+@WITHOUT_MOTION
 def test_one_time_for_all_frames_is_an_error(root):
     stop_time(root)
     assert "one time, but every moment needs its own (times from time_id in" in texts(check_capture(root), "error")
@@ -380,6 +395,7 @@ def test_the_quick_check_raises_on_damaged_frames(root):
         quick_findings(load_capture(root))
 
 
+@WITHOUT_MOTION
 def test_depth_that_is_no_nearer_to_the_points_than_a_constant_is_not_praised(root, monkeypatch):
     """Nearly all points have one depth, so that any depth can be aligned to them by a factor of 0."""
     write_depth(root, lambda depth: np.random.default_rng(0).uniform(0.1, 1.0, depth.shape))

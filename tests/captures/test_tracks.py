@@ -11,6 +11,8 @@ from warpgs.data.tracks import write_tracks
 from warpgs.synthetic.studio import StudioSize, studio_capture
 from warpgs.synthetic.studio_tracks import broken_tracks, exact_tracks
 
+pytestmark = pytest.mark.usefixtures("without_motion")
+
 SIZE = StudioSize(width=96, height=54, num_frames=12, num_samples=1, num_points=500)
 
 

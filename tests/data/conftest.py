@@ -31,6 +31,13 @@ def with_boards(tmp_path_factory):
 
 
 @pytest.fixture
+def without_motion(monkeypatch):
+    """Checks do not compare motion, which takes most of their time and says nothing of depth and points."""
+    monkeypatch.setattr("warpgs.captures.check.motions_of", lambda *_: [])
+    monkeypatch.setattr("warpgs.captures.check.check_turning", lambda *_: [])
+
+
+@pytest.fixture
 def edited(written, tmp_path):
     """A function that copies a layout's folder, to be changed."""
     return lambda layout: shutil.copytree(written[layout], tmp_path / "copy")

@@ -16,6 +16,8 @@ from warpgs.captures.check import check_capture, quick_findings
 from warpgs.captures.opening import load_capture
 from warpgs.data.depth_unit import fit_unit
 
+pytestmark = pytest.mark.usefixtures("without_motion")
+
 COUNT = 16
 
 
