@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from errno import ENAMETOOLONG
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -384,10 +384,9 @@ def read_numbers(path: Path, fields: dict[str, Any], key: str, shape: tuple[int,
     return values.astype(np.float64)
 
 
-def remove_numbered(folder: Path, name: Callable[[int], str]) -> None:
-    """Removes the files ``name(0)``, ``name(1)`` … up to the first that does not exist."""
-    for k in count():
-        path = folder / name(k)
-        if not path.is_file():
-            return
+def remove_numbered(folder: Path, name: Callable[[int], str]) -> list[Path]:
+    """Removes the files ``name(0)``, ``name(1)`` … up to the first that does not exist; returns them."""
+    removed = [*takewhile(Path.is_file, (folder / name(k) for k in count()))]
+    for path in removed:
         path.unlink()
+    return removed

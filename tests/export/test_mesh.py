@@ -162,11 +162,14 @@ def test_a_mesh_has_the_static_part_once_and_what_moves_at_each_time(job, tmp_pa
 
 
 def test_frames_are_ply_files_and_replace_what_was_exported_before(job, tmp_path):
-    write_mesh(job(frames=3, voxel=0.05))
-    write_mesh(job(keys=2, voxel=0.05))
+    assert "removed" not in write_mesh(job(frames=3, voxel=0.05))
+    removed = "\nremoved, as of an earlier export: "
+    summary = write_mesh(job(keys=2, voxel=0.05))
+    assert summary.endswith(f"{removed}static_mesh.ply, dynamic_mesh_00000.ply to dynamic_mesh_00002.ply")
     assert [path.name for path in tmp_path.iterdir()] == ["mesh.glb"]
     summary = write_mesh(job(frames=2, voxel=0.05))
     assert summary.startswith(f"static_mesh.ply and dynamic_mesh_00000.ply to dynamic_mesh_00001.ply in {tmp_path}: ")
+    assert summary.endswith(f"{removed}mesh.glb")
     names = ["dynamic_mesh_00000.ply", "dynamic_mesh_00001.ply", "static_mesh.ply"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     vertices = [read_ply(tmp_path / name, first_only=True)["vertex"] for name in names[1:]]

@@ -70,13 +70,15 @@ def write_mesh(job: Job) -> str:
     summary = counted(0 if static is None else len(static.faces), "static triangle")
     if times:
         summary += f" and {count:,} dynamic ones at {counted(len(times), 'time')}"
-    _remove_former(job)
+    former = _remove_former(job)
     if options.frames is None:
         path = str(job.file(NAME))
         size = write_mesh_glb(job.file(NAME), static, frames, options.seconds or SECONDS)
     else:
         path, size = _write_sequence(job.folder, static, frames)
-    return f"{path}: {summary}, {size / 1e6:.1f} MB\n{maker.note}\n{job.up_note}"
+    gone = [path.name for path in former if not path.exists()]
+    told = f"\nremoved, as of an earlier export: {_listed(gone)}" if gone else ""
+    return f"{path}: {summary}, {size / 1e6:.1f} MB\n{maker.note}\n{job.up_note}{told}"
 
 
 def _check(options: Export) -> None:
@@ -89,12 +91,21 @@ def _check(options: Export) -> None:
             raise ValueError(f"--{name} is for a mesh that moves in one file: omit it, or {single}")
 
 
-def _remove_former(job: Job) -> None:
+def _remove_former(job: Job) -> list[Path]:
     """Removes the meshes of an earlier export to the folder: they are of another scene, or its sequence was longer."""
-    if job.file(NAME) != job.folder:
-        remove_numbered(job.folder, _numbered)
-        for name in (NAME, STATIC):
-            (job.folder / name).unlink(missing_ok=True)
+    if job.file(NAME) == job.folder:
+        return []
+    others = [path for path in (job.folder / NAME, job.folder / STATIC) if path.is_file()]
+    for path in others:
+        path.unlink()
+    return [*others, *remove_numbered(job.folder, _numbered)]
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Names of files, of a sequence the first and the last."""
+    single = [name for name in names if name in (NAME, STATIC)]
+    numbered = names[len(single) :]
+    return ", ".join([*single, *([f"{numbered[0]} to {numbered[-1]}"] if len(numbered) > 1 else numbered)])
 
 
 def _write_sequence(folder: Path, static: Mesh | None, frames: Sequence[Mesh]) -> tuple[str, int]:
