@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 from tests.data import layouts
+from warpgs.data.results import depth as of_depth
+from warpgs.data.results import masks as of_masks
+from warpgs.data.results.checked import checked
 from warpgs.data.results.depth import read_depths
 from warpgs.data.results.masks import read_masks, read_object_mask
 from warpgs.files import write_png
@@ -36,6 +39,22 @@ def test_depth_of_all_frames_in_one_file_becomes_inverse_depth(tmp_path, depths,
     np.savez(tmp_path / "results.npz", depth=depths[..., None] if axis else depths, conf=np.ones_like(depths))
     found = [*read_depths(tmp_path / "results.npz", NAMES, SIZES)]
     np.testing.assert_allclose(np.array(found), inverse(depths), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("module", "read", "array"), [(of_depth, read_depths, "depth"), (of_masks, read_masks, "masks")]
+)
+def test_a_file_of_all_frames_is_read_once_and_checked_before_the_first_is_given(
+    tmp_path, monkeypatch, module, read, array
+):
+    path, reads = tmp_path / "results.npz", []
+    read_npz = module.read_npz
+    monkeypatch.setattr(module, "read_npz", lambda *arguments: reads.append(arguments) or read_npz(*arguments))
+    np.savez(path, **{array: np.ones((2, *SIZE[::-1]), np.float32)})
+    assert len([*checked(read, path, NAMES, SIZES)]) == 2
+    assert len(reads) == 1
+    with pytest.raises(ValueError, match=r"results\.npz"):
+        checked(read, path, NAMES, [SIZE, (SIZE[0], 2 * SIZE[1])])
 
 
 @pytest.mark.parametrize("file", ["{}/depth.npy", "{}.npy"])

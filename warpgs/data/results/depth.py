@@ -1,6 +1,6 @@
 """Depth as Depth Anything 3, VGGT and MoGe give it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,8 @@ from warpgs.data.npz import names_of, read_npz
 from warpgs.data.resized import inverse_of
 from warpgs.files import read_array, read_bounded
 
+from .checked import Results, Size
+
 MAX_STRETCH = 1.06
 """Maximum ratio of the aspect ratios of depth and image: networks round sides to multiples of 14."""
 
@@ -20,10 +22,8 @@ MAX_FILE = 1 << 30
 """Maximum size of a file of one frame [bytes]."""
 
 
-def read_depths(
-    path: Path, names: Sequence[str], sizes: Sequence[tuple[int, int]]
-) -> Iterator[Float[np.ndarray, "h w"]]:
-    """Inverse depth of frames, in the resolution of the network but with the shape of the image; NaN where unknown.
+def read_depths(path: Path, names: Sequence[str], sizes: Sequence[Size]) -> Results:
+    """[h, w] inverse depth of frames, in the network's resolution but the shape of the image; NaN where unknown.
 
     Args:
         path: An .npz file of Depth Anything 3, VGGT or SpatialTracker, or a folder of MoGe: <name>/depth.exr or .npy,
@@ -32,13 +32,10 @@ def read_depths(
         sizes: Width and height of each.
 
     Raises:
-        ValueError: If the file of a frame is missing, damaged, or has other frames or another shape.
+        ValueError: There or here, if the file of a frame is missing, damaged, or has other frames or another shape.
     """
     if path.is_dir():
-        for name, size in zip(names, sizes, strict=True):
-            file = _file_of(path, name)
-            yield _inverse(file, _read_file(file), size)
-        return
+        return Results(names, sizes, lambda name, size: _read_one(_file_of(path, name), size))
     key = next((name for name in ("depth", "depths") if name in names_of(path)), None)
     if key is None:
         raise ValueError(f"{path} has no array depth [N, H, W], as Depth Anything 3 and VGGT write it")
@@ -48,8 +45,11 @@ def read_depths(
         raise ValueError(
             f"{path}: {key} must be [N, H, W] of the camera's {len(names)} frames, got {list(depths.shape)}"
         )
-    for depth, size in zip(depths, sizes, strict=True):
-        yield _inverse(path, depth, size)
+    return Results([*depths], sizes, lambda depth, size: _inverse(path, depth, size))
+
+
+def _read_one(file: Path, size: Size) -> Float[np.ndarray, "h w"]:
+    return _inverse(file, _read_file(file), size)
 
 
 def _file_of(folder: Path, name: str) -> Path:

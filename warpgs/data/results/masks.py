@@ -1,6 +1,6 @@
 """Masks of objects as SAM 2 and SAM 3 give them: what is of an object is dynamic."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,8 @@ from warpgs.data.images import decode, indices_of
 from warpgs.data.loaders.listed import find_file
 from warpgs.data.npz import names_of, read_npz
 from warpgs.data.resized import check_shape, read_resized_mask, resize_mask
+
+from .checked import Results, Size
 
 ARRAYS = ("masks", "out_binary_masks")
 """Names of the array of masks: [F, H, W], or with axes of objects before the last two."""
@@ -50,8 +52,8 @@ def _refuse_ids(path: Path, stored: Shaped[np.ndarray, "H W ..."]) -> None:
         )
 
 
-def read_masks(path: Path, names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Iterator[Bool[np.ndarray, "H W"]]:
-    """What is dynamic in frames, in their size.
+def read_masks(path: Path, names: Sequence[str], sizes: Sequence[Size]) -> Results:
+    """[H, W] what is dynamic in frames, in their size.
 
     Args:
         path: An .npz file with the masks of all frames; or a folder with a PNG or .npz file of each, named like it.
@@ -59,7 +61,7 @@ def read_masks(path: Path, names: Sequence[str], sizes: Sequence[tuple[int, int]
         sizes: Width and height of each.
 
     Raises:
-        ValueError: If there is no mask of a frame, or it is damaged, of other frames or of another shape.
+        ValueError: There or here, if there is no mask of a frame, or it is damaged, of other frames or another shape.
     """
     if not path.is_dir():
         masks = _read(path)
@@ -67,14 +69,15 @@ def read_masks(path: Path, names: Sequence[str], sizes: Sequence[tuple[int, int]
             raise ValueError(
                 f"{path}: masks must be [N, H, W] of the camera's {len(names)} frames, got {list(masks.shape)}"
             )
-        for mask, size in zip(masks, sizes, strict=True):
-            yield _joined(path, mask, size)
-        return
-    for name, size in zip(names, sizes, strict=True):
-        file = find_file(path, name, (".png", ".png.png", ".npz"))
-        if file is None:
-            raise ValueError(f"{path} has no mask of frame {name}: expected {name}.png or {name}.npz")
-        yield read_object_mask(file, size) if file.suffix.lower() == ".png" else _joined(file, _read(file), size)
+        return Results([*masks], sizes, lambda mask, size: _joined(path, mask, size))
+    return Results(names, sizes, lambda name, size: _read_one(path, name, size))
+
+
+def _read_one(folder: Path, name: str, size: Size) -> Bool[np.ndarray, "H W"]:
+    file = find_file(folder, name, (".png", ".png.png", ".npz"))
+    if file is None:
+        raise ValueError(f"{folder} has no mask of frame {name}: expected {name}.png or {name}.npz")
+    return read_object_mask(file, size) if file.suffix.lower() == ".png" else _joined(file, _read(file), size)
 
 
 def _read(path: Path) -> Shaped[np.ndarray, "..."]:
