@@ -21,6 +21,7 @@ from warpgs.editing.objects import NAME as OBJECTS
 from warpgs.editing.objects import write_objects
 from warpgs.editing.options import Editing, Edits
 from warpgs.runs.run import Run
+from warpgs.viewer import source as of_runs
 from warpgs.viewer.cleanup import Cleanup, box_edges
 from warpgs.viewer.cleanup_controls import (
     BRUSH,
@@ -522,6 +523,21 @@ def test_a_new_run_has_the_checkpoint_and_the_edits(cleanup, run):
     assert torch.equal(Run.open(copy, "cpu").trained_scene().splats(0.3).means, cleanup.whole.splats(0.3).means)
     cleanup.controls.copy.click()
     assert "exists already: choose another name" in note(cleanup)
+
+
+def test_images_are_rendered_while_a_new_run_is_written(cleanup, run, monkeypatch):
+    was_locked = []
+    save = of_runs.save_edits
+
+    def watched(*arguments):
+        was_locked.append(cleanup._rendering.locked())
+        return save(*arguments)
+
+    monkeypatch.setattr(of_runs, "save_edits", watched)
+    cleanup.controls.name.value = "cleaned"
+    cleanup.controls.copy.click()
+    assert note(cleanup) == "saved as cleaned, beside this run"
+    assert was_locked == [False]
 
 
 @pytest.mark.parametrize("name", ["", "../other", ".hidden", "a/b"])

@@ -265,8 +265,10 @@ class Cleanup:
     def _copy(self) -> None:
         """Saves the edits in a copy of the run."""
         try:
+            edits = self.edits
             with self._rendering:
-                folder = self._source.copy(str(self._controls.name.value), self.edits)
+                self._source.edited(edits)
+            folder = self._source.copy(str(self._controls.name.value), edits)  # meanwhile, browsers see images
             self._note(f"saved as {folder.name}, beside this run")
         except (ValueError, OSError) as error:
             self._note(one_line(error))

@@ -49,7 +49,7 @@ class Source:
     def __init__(self, run: Run, follow: bool = False) -> None:
         self.run, self.follow = run, follow
         self.note = self.progress = ""
-        self._reading, self._asking, self._finding = (threading.Lock() for _ in range(3))
+        self._reading, self._asking, self._finding, self._copying = (threading.Lock() for _ in range(4))
         self._loaded: tuple[Path, int] | None = None
         self._checked = -POLL_SECONDS
         self._scene: TrainedScene | None = None if follow else run.trained_scene()
@@ -114,12 +114,16 @@ class Source:
     def copy(self, name: str, edits: Edits) -> Path:
         """Saves the plan and the checkpoint that is shown as another run beside this one, with edits of its own.
 
+        Those have been made by ``edited``, which refuses some; this renders nothing, and one copy is written at a time.
+
         Raises:
-            ValueError: If the name is none for a folder or taken, the edits cannot be made, or the run was trained
-                further since it was opened.
+            ValueError: If the name is none for a folder or taken, or the run was trained further since it was opened.
             OSError: If it cannot be written.
         """
-        self.edited(edits)
+        with self._copying:
+            return self._copy(name, edits)
+
+    def _copy(self, name: str, edits: Edits) -> Path:
         assert self._scene is not None
         folder, newest = self.run.folder.resolve().parent / name, self.run.newest_checkpoint()
         if not keyframes.NAME.fullmatch(name):
