@@ -134,7 +134,7 @@ def no_frame(name):
 def test_stage_2_compares_branches_unless_masks_are_estimates(assume, asked, estimated):
     cameras = {"a": make_camera()}
     capture = Capture("shot", cameras, ["a"], [], torch.zeros(0, 3), None, no_frame, estimated_masks=estimated)
-    plan, notes = make_plan(plain.config(assume=assume, loss=LossConfig(branches_in_stage2=asked)), capture)
+    plan, notes, _ = make_plan(plain.config(assume=assume, loss=LossConfig(branches_in_stage2=asked)), capture)
     distrusted = asked == "given-masks" and estimated and assume == "masks"
     assert plan.branches_in_stage2 == (asked != "no" and not distrusted)
     assert [note.partition(":")[0] for note in notes] == (["the masks are estimates"] if distrusted else [])
@@ -148,7 +148,7 @@ def test_corrections_of_poses_are_slower_for_few_frames(num, rate):
     moving = {f"{k}": dataclasses.replace(still, viewmat=still.viewmat + k * shift) for k in range(num)}
     cameras = moving | {f"{k} again": camera for k, camera in moving.items()}
     capture = Capture("shot", cameras, list(cameras), [], torch.zeros(0, 3), None, no_frame)
-    plan, notes = make_plan(plain.config(optim=plain.optim(poses=1e-3)), capture)
+    plan, notes, _ = make_plan(plain.config(optim=plain.optim(poses=1e-3)), capture)
     assert plan.optim.poses == pytest.approx(rate)
     assert any(f"each of {num} poses" in note for note in notes) == (rate < 1e-3)
 

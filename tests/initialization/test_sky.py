@@ -9,7 +9,7 @@ from tests import plain, tiny
 from tests.lens_captures import changed
 from warpgs.captures.opening import load_capture
 from warpgs.initialization.plan import make_plan, mean_color
-from warpgs.initialization.prepare_start import prepare_start
+from warpgs.initialization.prepare_start import prepare_again, prepare_start
 from warpgs.initialization.sky import find_sky
 from warpgs.model.dome import Dome
 from warpgs.synthetic.studio import StudioSize, studio_capture, trace
@@ -78,7 +78,7 @@ def test_without_depth_and_points_that_agree_there_is_no_sky(capture, missing):
 
 
 def test_a_run_has_a_sky_where_the_capture_shows_one(capture, cache):
-    plan, notes = make_plan(dataclasses.replace(tiny.CONFIG, background="auto"), capture)
+    plan, notes, _ = make_plan(dataclasses.replace(tiny.CONFIG, background="auto"), capture)
     assert plan.background == "sky"
     assert any("the sky, 3" in note and "is behind all Gaussians" in note for note in notes)
     assert background(opened(cache, sky=False)) == mean_color(opened(cache, sky=False))
@@ -99,6 +99,19 @@ def test_no_gaussian_starts_in_the_sky(capture):
     means = start.scene.static.means
     assert len(means) > 500
     assert not (means == distant).all(1).any()
+
+
+@pytest.mark.parametrize("asked", ["auto", "sky"])
+def test_the_sky_is_looked_for_once(capture, monkeypatch, asked):
+    looked = []
+    for module in ("plan", "prepare_start"):
+        find = lambda seen: looked.append(seen) or find_sky(seen)  # noqa: E731
+        monkeypatch.setattr(f"warpgs.initialization.{module}.find_sky", find)
+    start = prepare_start(dataclasses.replace(tiny.CONFIG, background=asked, exposure=False), capture)
+    assert (start.plan.background, len(looked)) == ("sky", 1)
+    again = prepare_again(start.plan, capture)
+    assert len(looked) == 2
+    assert torch.equal(again.scene.dome.texels, start.scene.dome.texels)
 
 
 def test_the_sky_begins_as_frames_show_it(capture):

@@ -8,6 +8,7 @@ import torch
 
 from tests import plain, tiny
 from warpgs.initialization.plan import make_plan
+from warpgs.initialization.prepare_start import prepare_again
 from warpgs.model.segments import nearest, window
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
@@ -101,9 +102,17 @@ def test_a_plan_knows_the_number_of_segments(data, monkeypatch):
     config = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, segments=None))
     assert make_plan(config, capture)[0].model.segments == 1
     monkeypatch.setattr("warpgs.model.segments.MAX_TIMES", 3)
-    plan, notes = make_plan(config, capture)
+    plan, notes, _ = make_plan(config, capture)
     assert plan.model.segments == 2
     assert any("2 segments of about 4 times" in note for note in notes)
+
+
+def test_a_run_that_is_resumed_says_its_number_of_segments(data):
+    capture = tiny.trainer(data, data, tiny.CONFIG).capture
+    for segments, told in ((2, True), (1, False)):
+        config = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, segments=segments))
+        notes = prepare_again(make_plan(config, capture).plan, capture).notes
+        assert any(note.startswith("2 segments of about 4 times have") for note in notes) == told
 
 
 def test_splines_and_segments_exclude_each_other(data):

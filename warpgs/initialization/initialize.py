@@ -20,7 +20,7 @@ from warpgs.views.views import Views
 from .dynamic_points import MAX_SCALE, DynamicPoints, gaussians_in_box, is_depth_known, unproject_pixels
 from .motion_fit import MAX_POINTS, Observed, fit_motion
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
-from .sky import find_sky, make_dome, without_points
+from .sky import Sky, make_dome, without_points
 from .track_paths import dynamic_paths
 from .tracked_start import start_from_tracks
 from .tracks import find_tracks
@@ -33,14 +33,16 @@ RESOLUTION = 0.25
 place. A Gaussian as small as the error between the scans would be culled and pruned."""
 
 
-def initial_scene(config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator) -> SplitScene:
+def initial_scene(
+    config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator, sky: Sky | None = None
+) -> SplitScene:
     """Static Gaussians at the sparse points (at random ones in the scene's box if there are none), no dynamic ones yet.
 
-    If everything is assumed to be dynamic, there are no static Gaussians either. The sky gets none.
+    If everything is assumed to be dynamic, there are no static Gaussians either. The sky gets none, where depth tells
+    it (``sky``).
     """
     dome = None
     if config.background == "sky":
-        sky = find_sky(capture)
         dome, capture = make_dome(capture, sky), without_points(capture, sky)
     center, half_size = scene_box(capture.points)
     degree = config.model.sh_degree

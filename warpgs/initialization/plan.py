@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from warpgs.model.poses import shared_places
 from warpgs.model.segments import OVERLAP, default_number
 from warpgs.runtime.devices import choose_device
 
-from .sky import find_sky
+from .sky import Sky, find_sky
 
 MANY_POSES = 80
 """Number of poses of training cameras from which on their corrections have the whole rate. Each of fewer is seen more
@@ -23,21 +24,35 @@ MAX_AVERAGED = 50
 """Maximum number of frames whose mean colour is the background."""
 
 
-def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
-    """The plan of a new run, and sentences on what was looked up.
+class Planned(NamedTuple):
+    """What runs, and what was looked up for it.
+
+    Attributes:
+        plan: The plan.
+        notes: A sentence on each value that was looked up.
+        sky: The sky that is the background, if the capture shows it.
+    """
+
+    plan: Plan
+    notes: list[str]
+    sky: Sky | None
+
+
+def make_plan(config: TrainConfig, capture: Capture) -> Planned:
+    """The plan of a new run.
 
     Raises:
         ValueError: If a number of the config is out of its range, or there is no such device.
     """
     config, notes = scaled(config), []
-    (background, found), loss = _background(config, capture), config.loss
-    notes += found
+    (background, sky), loss = _background(config, capture), config.loss
+    notes += [] if sky is None else [sky.described]
     asked, num = config.model.time_bands, len(capture.moments)
     segments = _num_segments(config.model, num)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, segments=segments))
+    notes += describe_segments(segments, num)
     if segments > 1:
-        num = math.ceil(num * (1.0 + OVERLAP) / segments)
-        notes.append(f"{segments} segments of about {num} times have dynamic Gaussians and a deformation of their own")
+        num = _times_of_a_segment(segments, num)
     bands = determined_bands(config.model, num)
     if bands < asked:
         notes.append(f"the networks get {bands} of {asked} frequencies of time: {num} times determine no more")
@@ -51,7 +66,19 @@ def make_plan(config: TrainConfig, capture: Capture) -> tuple[Plan, list[str]]:
     if loss.branches_in_stage2 == "given-masks" and capture.assuming(config.assumption).uses_estimated_masks:
         notes.append("the masks are estimates: stage II compares the image of all Gaussians only, not each branch's")
         branches = False
-    return Plan.of(config, choose_device(config.device), background, branches), notes
+    return Planned(Plan.of(config, choose_device(config.device), background, branches), notes, sky)
+
+
+def describe_segments(segments: int | None, num_times: int) -> list[str]:
+    """A sentence on the segments of a model, if it has several."""
+    if segments is None or segments == 1:
+        return []
+    num = _times_of_a_segment(segments, num_times)
+    return [f"{segments} segments of about {num} times have dynamic Gaussians and a deformation of their own"]
+
+
+def _times_of_a_segment(segments: int, num_times: int) -> int:
+    return math.ceil(num_times * (1.0 + OVERLAP) / segments)
 
 
 def _num_segments(model: ModelConfig, num_times: int) -> int:
@@ -67,25 +94,21 @@ def _num_segments(model: ModelConfig, num_times: int) -> int:
     return 1
 
 
-def _background(config: TrainConfig, capture: Capture) -> tuple[Background, list[str]]:
-    """The background of a config, and a sentence if it was found: what it asks for, or that of the capture.
+def _background(config: TrainConfig, capture: Capture) -> tuple[Background, Sky | None]:
+    """The background of a config, and the sky if it was found: what it asks for, or that of the capture.
 
     Instead of black, it is a sky where the capture shows one, or the mean colour. Black and white get their names:
     captures over white know where frames are empty.
     """
     asked = config.background
     if asked == "capture" or (asked in ("auto", "mean") and capture.background != "black"):
-        return capture.background, []
+        return capture.background, None
     seen = capture.assuming(config.assumption)  # where nothing is static, dynamic Gaussians have to paint the sky
-    if asked == "auto" and (sky := find_sky(seen)) is not None:
-        return "sky", [
-            f"the sky, {sky.share:.0%} of the pixels, is behind all Gaussians: its depth is beyond all points"
-        ]
-    if asked == "sky":
-        return "sky", []
+    if asked in ("auto", "sky") and ((sky := find_sky(seen)) is not None or asked == "sky"):
+        return "sky", sky
     color = mean_color(capture) if asked == "auto" or asked == "mean" else background_color(asked)
     names: dict[Background, Background] = {value: name for name, value in COLORS.items()}
-    return names.get(color, color), []
+    return names.get(color, color), None
 
 
 def mean_color(capture: Capture) -> Color:

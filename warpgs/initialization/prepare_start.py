@@ -19,7 +19,8 @@ from .alignment import DepthTrust, align_to_points, require_no_depth
 from .exposure import exposure_gains
 from .initialize import can_fit_motion
 from .object_depth import fill_object_depth
-from .plan import make_plan
+from .plan import describe_segments, make_plan
+from .sky import Sky, find_sky
 from .start import Remedy, Start, first_scene
 from .tracked_start import for_tracks
 from .tracks import find_tracks
@@ -41,13 +42,15 @@ def prepare_start(config: TrainConfig, capture: Capture) -> Start:
             excludes, or an option has an unknown value or one that the capture does not suit.
     """
     _ = capture.tracks  # what is damaged is refused now, not after the first stage; copies of the capture keep them
-    plan, notes = make_plan(config, capture)
-    return _with_remedies(_read(plan, capture, resumed=False).noted(*notes))
+    plan, notes, sky = make_plan(config, capture)
+    return _with_remedies(_read(plan, capture, sky, resumed=False).noted(*notes))
 
 
 def prepare_again(plan: Plan, capture: Capture) -> Start:
     """What a run starts from that was begun with a plan, before its checkpoint is restored; as ``prepare_start``."""
-    return _with_remedies(_read(plan, capture, resumed=True))
+    notes = describe_segments(plan.model.segments, len(capture.moments))
+    sky = find_sky(capture.assuming(plan.assume)) if plan.background == "sky" else None
+    return _with_remedies(_read(plan, capture, sky, resumed=True).noted(*notes))
 
 
 def _with_remedies(start: Start) -> Start:
@@ -57,7 +60,7 @@ def _with_remedies(start: Start) -> Start:
     return start
 
 
-def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
+def _read(plan: Plan, capture: Capture, sky: Sky | None, resumed: bool) -> Start:
     """The start before any remedy."""
     capture = capture.assuming(plan.assume).over(plan.background)
     num, device = len(capture.train), torch.device(plan.device)
@@ -70,10 +73,11 @@ def _read(plan: Plan, capture: Capture, resumed: bool) -> Start:
         plan,
         capture,
         views,
-        first_scene(plan, capture, views),
+        first_scene(plan, capture, views, sky),
         torch.full((num, 2), torch.nan, dtype=torch.float32, device=device),
         DepthTrust(*torch.ones(2, num, dtype=torch.float32, device=device)),
         resumed,
+        sky=sky,
     )
     if views.resident:
         capture.forget_frames()  # the views hold them

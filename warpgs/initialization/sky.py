@@ -50,6 +50,11 @@ class Sky:
     frames: list[Frame]
     masks: list[Bool[Tensor, "H W"]]
 
+    @property
+    def described(self) -> str:
+        """A sentence for the user."""
+        return f"the sky, {self.share:.0%} of the pixels, is behind all Gaussians: its depth is beyond all points"
+
     def holds(self, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
         """[P] whether most frames that see a point see it in the sky."""
         seen, inside = torch.zeros(2, len(points), dtype=torch.int64)

@@ -15,6 +15,7 @@ from warpgs.views.views import Views
 
 from .alignment import DepthTrust
 from .initialize import initial_scene
+from .sky import Sky
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Start:
         num_aligned: Number of views whose depth could be aligned to the sparse points.
         num_with_objects: Number of views in which the size of dynamic objects gives or corrects their depth.
         notes: A sentence of each remedy on what it found or changed.
+        sky: Where frames show the sky, if that is the background and depth tells it.
     """
 
     plan: Plan
@@ -47,6 +49,7 @@ class Start:
     num_aligned: int = 0
     num_with_objects: int = 0
     notes: tuple[str, ...] = ()
+    sky: Sky | None = None
 
     @property
     def has_depth(self) -> bool:
@@ -55,16 +58,16 @@ class Start:
 
     def planned(self, plan: Plan) -> "Start":
         """The same with another plan, and the initial scene that it implies."""
-        return replace(self, plan=plan, scene=first_scene(plan, self.capture, self.views))
+        return replace(self, plan=plan, scene=first_scene(plan, self.capture, self.views, self.sky))
 
     def noted(self, *notes: str) -> "Start":
         """The same, with more notes."""
         return replace(self, notes=(*self.notes, *notes))
 
 
-def first_scene(plan: Plan, capture: Capture, views: Views) -> SplitScene:
+def first_scene(plan: Plan, capture: Capture, views: Views, sky: Sky | None) -> SplitScene:
     """The initial scene of a plan."""
-    return initial_scene(plan, capture, views, random_numbers(plan.seed, "points", 0, 0))
+    return initial_scene(plan, capture, views, random_numbers(plan.seed, "points", 0, 0), sky)
 
 
 class Remedy(NamedTuple):
