@@ -78,12 +78,17 @@ def trained(data, folder, config, scale=1.0, shift=(0.0, 0.0, 0.0)):
     return numbers, terms, found
 
 
+@pytest.fixture(scope="module", params=DENSITY)
+def plain(request, data, quickly, tmp_path_factory):
+    """A config of each strategy, and what it trains on the capture as it is."""
+    config = dataclasses.replace(SMALL, densify=dataclasses.replace(SMALL.densify, strategy=request.param))
+    torch.manual_seed(0)
+    return config, trained(data, tmp_path_factory.mktemp("plain"), config)
+
+
 @pytest.mark.parametrize("change", [{"scale": 10.0}, {"scale": 0.1}, {"shift": (2.0, -1.0, 3.0)}], ids=str)
-@pytest.mark.parametrize("strategy", DENSITY)
-def test_scaling_and_moving_a_capture_changes_no_decision(data, tmp_path, strategy, change):
-    densify = dataclasses.replace(SMALL.densify, strategy=strategy)
-    config = dataclasses.replace(SMALL, densify=densify)
-    numbers, terms, expected = trained(data, tmp_path / "plain", config)
+def test_scaling_and_moving_a_capture_changes_no_decision(data, tmp_path, plain, change):
+    config, (numbers, terms, expected) = plain
     numbers_then, terms_then, found = trained(data, tmp_path / "changed", config, **change)
     assert numbers_then == numbers
     assert numbers[0][0] < numbers[-1][0] < 4 * numbers[0][0]  # some grow, and not all
