@@ -91,6 +91,18 @@ def test_what_a_killed_preparation_leaves_is_taken_over(shots, tmp_path, true_ca
     assert len(load_capture(tmp_path / "made").train) == COUNT
 
 
+@pytest.fixture(scope="module")
+def begun(shots, masks, tmp_path_factory):
+    """Preparations with given masks that stopped before and after the capture was written."""
+    folder = tmp_path_factory.mktemp("begun")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(steps, "recover_cameras", boards.true_cameras)
+        patch.setattr(steps, "doubts_of_motion", lambda *_: [])
+        for before in ("write_capture", "Steps.add_depth"):
+            begin(shots, folder / before, patch, Options(masks=str(masks), depth="none"), before)
+    return folder
+
+
 LOST = {
     "a frame": (".prepare/frames/frame_000004.png", "frames"),
     "the index of the frames": (".prepare/frames/index_frame.json", "frames"),
@@ -104,11 +116,11 @@ LOST = {
 @pytest.mark.parametrize("is_emptied", [False, True])
 @pytest.mark.parametrize("lost", LOST)
 def test_a_step_whose_result_is_lost_is_done_again_with_all_that_follow(
-    shots, masks, tmp_path, monkeypatch, true_cameras, lost, is_emptied
+    shots, masks, begun, tmp_path, true_cameras, lost, is_emptied
 ):
     (name, step), root, lines = LOST[lost], tmp_path / "made", []
     options = Options(masks=str(masks), depth="none")
-    begin(shots, root, monkeypatch, options, before="Steps.add_depth" if step == "capture" else "write_capture")
+    shutil.copytree(begun / ("Steps.add_depth" if step == "capture" else "write_capture"), root)
     path = root / name
     path.write_bytes(b"") if is_emptied else path.unlink()
     pipeline.prepare(shots, root, options, log=lines.append)
@@ -139,10 +151,19 @@ def contents(root):
     return {path.relative_to(root): path.read_bytes() for path in paths}
 
 
+@pytest.fixture(scope="module")
+def finished(shots, tmp_path_factory):
+    root = tmp_path_factory.mktemp("finished") / "made"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(steps, "recover_cameras", boards.true_cameras)
+        patch.setattr(steps, "doubts_of_motion", lambda *_: [])
+        pipeline.prepare(shots, root, OPTIONS)
+    return root
+
+
 @pytest.mark.parametrize("name", ["rgb/1x/frame_000004.png", "camera/frame_000000.json", "points.npy", "dataset.json"])
-def test_a_finished_capture_without_one_of_its_files_is_refused_by_name(shots, tmp_path, true_cameras, name):
-    root = tmp_path / "made"
-    pipeline.prepare(shots, root, OPTIONS)
+def test_a_finished_capture_without_one_of_its_files_is_refused_by_name(shots, finished, tmp_path, true_cameras, name):
+    root = shutil.copytree(finished, tmp_path / "made")
     (root / name).unlink()
     with pytest.raises(ValueError, match=f"^{root} was finished before, but {root / name} is missing: .* --force$"):
         pipeline.prepare(shots, root, OPTIONS)

@@ -26,6 +26,7 @@ def test_the_mask_that_a_video_lacks_is_named_like_its_frame(tmp_path):
         find_given_masks(write(tmp_path, "frame 4.png"), [SourceFrame("1_000000", "frame 4", 4, 500)])
 
 
-def test_masks_of_a_folder_may_be_named_like_its_files(tmp_path):
-    folder = write(tmp_path, "shot4.jpg.png")
-    assert find_given_masks(folder, [SourceFrame("frame_000000", "shot4.jpg", 4, 4)]) == [folder / "shot4.jpg.png"]
+@pytest.mark.parametrize("name", ["shot4.jpg.png", "shot4.png", "shot4.png.png", "frame_000000.png.png"])
+def test_masks_of_a_folder_may_be_named_like_its_files_or_the_frames(tmp_path, name):
+    folder = write(tmp_path, name)
+    assert find_given_masks(folder, [SourceFrame("frame_000000", "shot4.jpg", 4, 4)]) == [folder / name]
