@@ -1,5 +1,6 @@
 """Fixtures of all tests; every annotated shape and type of the package is checked at run time while they run."""
 
+import os
 from pathlib import Path
 
 import jaxtyping
@@ -26,6 +27,15 @@ def pytest_configure(config):
     """Files in their order: with those of few tests last, a single long one would keep one of two workers busy."""
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
+    _share_cores(int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)))
+
+
+def _share_cores(num_workers: int) -> None:
+    """Gives each of several workers, and its processes, a part of the cores: threads that wait for others spin."""
+    if num_workers > 1:
+        num = max(1, (os.cpu_count() or 1) // num_workers)
+        torch.set_num_threads(num)
+        os.environ.setdefault("OMP_NUM_THREADS", str(num))
 
 
 @pytest.fixture(autouse=True)
