@@ -39,6 +39,17 @@ def test_weights_sum_to_one_and_are_those_of_one_segment_between_overlaps():
     assert error(segments.weights(SEAM, NUM), torch.tensor([0.5, 0.5, 0.0])) < 1e-5
 
 
+def test_in_an_overlap_one_segment_alone_can_be_chosen():
+    for time in (SEAM, SEAM - 0.4 * segments.OVERLAP / NUM, SEAM + 0.4 * segments.OVERLAP / NUM):
+        found = [segments.weights(time, NUM, torch.tensor([choice])) for choice in (-1.0, 0.0, 1.0)]
+        assert found[0].tolist() == [1.0, 0.0, 0.0]
+        assert torch.equal(found[1], segments.weights(time, NUM))
+        assert found[2].tolist() == [0.0, 1.0, 0.0]
+    for time in (EARLY, MIDDLE, torch.tensor([1.0])):
+        assert torch.equal(segments.weights(time, NUM, torch.tensor([1.0])), segments.weights(time, NUM))
+        assert torch.equal(segments.weights(time, NUM, torch.tensor([-1.0])), segments.weights(time, NUM))
+
+
 def test_windows_of_segments_are_where_their_weights_are():
     for segment in range(NUM):
         start, end = segments.window(segment, NUM)

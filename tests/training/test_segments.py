@@ -10,6 +10,7 @@ from tests import plain, tiny
 from warpgs.initialization.plan import make_plan
 from warpgs.initialization.prepare_start import prepare_again
 from warpgs.model.segments import nearest, window
+from warpgs.rendering import render
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.logger import TrainingLogger
@@ -165,3 +166,22 @@ def test_an_image_has_room_for_the_dynamic_gaussians_of_its_segment(data, tmp_pa
     change = trainer._adaptation(tiny.plan_to(trainer, "densify"), Mock(spec=TrainingLogger))
     capacity = dataclasses.replace(change, views=views).capacity
     assert capacity == 3 * 32 * 24 - len(trainer.scene.static) - tiny.MODEL.dynamic_points
+
+
+def test_views_of_an_overlap_show_each_segment_alone_in_a_third_of_the_iterations(data, tmp_path, monkeypatch):
+    trainer, seen = tiny.trainer(data, tmp_path, CONFIG), set()
+    trainer.iteration = trainer.protocol.stage1.start
+    trainer._add_dynamic_gaussians()
+    trainer.views._times[:] = 0.5
+    segments = trainer.scene.dynamic.segments
+
+    def rendered(splats, *others):
+        opacities = splats.opacities[len(trainer.scene.static) :]
+        seen.add(tuple(bool((opacities[segments == k] > 0.0).any()) for k in range(2)))
+        return render(splats, *others)
+
+    monkeypatch.setattr("warpgs.training.step.render", rendered)
+    for seed in range(3):
+        plan = trainer.protocol.at(trainer.iteration)
+        trainer.step(plan, trainer._sample(plan)._replace(dropout_seed=seed))
+    assert seen == {(True, False), (True, True), (False, True)}

@@ -186,7 +186,7 @@ class SplitScene(nn.Module):
                 offsets, other_offsets = self._offsets(own, points, time)
         static_changes, dynamic_changes = Changes(logit_residuals=logit_residuals), Changes(offsets)
         geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
-        geometry = geometry._replace(opacities=self._faded(geometry.opacities, time))
+        geometry = geometry._replace(opacities=self.faded(geometry.opacities, time))
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
         splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree)
         return self._reflecting(splats), other_offsets
@@ -218,12 +218,17 @@ class SplitScene(nn.Module):
         """Offsets of the dynamic Gaussians at a time; one number or [D] of noise is added to it for the network."""
         return self._offsets(PointsInTime(self.dynamic.means, time if noise is None else time + noise), None, time)[0]
 
-    def _faded(self, opacities: Float[Tensor, " N"], time: Float[Tensor, "1"]) -> Float[Tensor, " N"]:
-        """Opacities, of which those of the dynamic Gaussians are 0 outside of their segments, if they have any."""
+    def faded(
+        self, opacities: Float[Tensor, " N"], time: Float[Tensor, "1"], choice: Float[Tensor, "1"] | None = None
+    ) -> Float[Tensor, " N"]:
+        """Opacities, of which those of the dynamic Gaussians are 0 outside of their segments, if they have any.
+
+        ``choice`` says what is seen in overlaps, as of ``segments.weights``.
+        """
         dynamic = self.dynamic
         if dynamic.segments is None:
             return opacities
-        weights = segments.weights(time, self.num_segments).index_select(0, dynamic.segments)
+        weights = segments.weights(time, self.num_segments, choice).index_select(0, dynamic.segments)
         return torch.cat([opacities[: len(self.static)], segments.faded(dynamic.logit_opacities, weights)])
 
     def rows(self) -> segments.SegmentRows:

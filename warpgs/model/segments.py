@@ -51,10 +51,19 @@ def nearest(time: Float[Tensor, " T"], num: int) -> Int64[Tensor, " T"]:
     return (time * num).long().clamp(0, num - 1)
 
 
-def weights(time: Float[Tensor, "1"], num: int) -> Float[Tensor, " num"]:
-    """Weight of each segment of ``num`` at a time in [0, 1]; they sum to 1."""
+def weights(time: Float[Tensor, "1"], num: int, choice: Float[Tensor, "1"] | None = None) -> Float[Tensor, " num"]:
+    """Weight of each segment of ``num`` at a time in [0, 1]; they sum to 1.
+
+    Args:
+        time: The time.
+        num: Number of segments.
+        choice: What is seen in an overlap: its earlier segment alone (-1), both (0) or the later one alone (1); both if
+            None.
+    """
     edges = torch.arange(1, num, device=time.device)
     begun = ((time * num - edges) / OVERLAP + 0.5).clamp(0.0, 1.0)
+    if choice is not None:
+        begun = torch.where((begun > 0.0) & (begun < 1.0), (begun + choice).clamp(0.0, 1.0), begun)
     return torch.cat([torch.ones_like(time), begun]) - torch.cat([begun, torch.zeros_like(time)])
 
 

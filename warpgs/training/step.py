@@ -16,6 +16,7 @@ from warpgs.evaluation.image_quality import MIN_SQUARED_ERROR
 from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.dome import Dome
 from warpgs.model.scene import PointsInTime, SplitScene
+from warpgs.model.splats import Splats
 from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
 from warpgs.runtime import ranks
@@ -180,6 +181,7 @@ class Step:
         points = self._points(view) if phase.use_deformation and self.config.loss.acceleration > 0 else None
         splats, offsets = self.scene.splats_and_offsets(points, view.time, *flags, phase.sh_degree, noise, is_hidden)
         paths = None if points is None or offsets is None else paths_of(points, offsets)
+        splats = self._with_chosen_segments(splats, view.time)
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
@@ -202,6 +204,16 @@ class Step:
         self.density.observe(splats, view.camera, rendering.radii)
         self._add_to_sums(terms, rendering, view)
         return ()
+
+    def _with_chosen_segments(self, splats: Splats, time: Float[Tensor, "1"]) -> Splats:
+        """In an overlap of segments, each of them alone or both, in a third of the iterations each.
+
+        So each segment learns to show all of the overlap by itself, and does not change where the other one fades.
+        """
+        if self.scene.num_segments == 1:
+            return splats
+        choice = self._inputs.dropout_seed % 3 - 1.0
+        return replace(splats, opacities=self.scene.faded(splats.opacities, time, choice))
 
     def _backgrounds(self) -> Float[Tensor, "3 3"]:
         """Colours behind the joint, the static and the dynamic image; the first two are black under a sky.
