@@ -194,7 +194,7 @@ def test_lpips_is_measured_with_the_network_that_is_given():
     assert result.views[1].values["masked_lpips"] == pytest.approx((error[:, :5].mean() / 2).item())
 
 
-LENS = Lens(60, 44, (62.0, 58.0), (31.3, 20.6), (-0.14, 0.05, 0.006, -0.004))
+LENS = Lens(30, 22, (31.0, 29.0), (15.6, 10.3), (-0.14, 0.05, 0.006, -0.004))
 
 
 def pattern(x, y):
