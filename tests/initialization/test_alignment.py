@@ -143,3 +143,20 @@ def test_views_that_are_fitted_together_have_alignments_of_their_own(monkeypatch
             found, unknown = alignment.align_to_rendering(before, views, scene, 0), 7.0
         expected = torch.tensor([[1.0, 0.0], [unknown, unknown], [0.25, 0.0]])
         assert torch.allclose(found, expected, atol=2e-3, equal_nan=True)  # depth is stored in half precision
+
+
+def test_of_many_views_some_pixels_are_compared_with_the_rendering(monkeypatch):
+    depth = 1.5 + 2.5 * torch.rand(HEIGHT, WIDTH, generator=generator(3))
+    capture = make_capture(torch.zeros(0, 3), inverse_depth=(1.0 / depth - 0.1) / 2.0)
+    views, numbers, fit = views_of(capture), [], depth_alignment.fit_scale_offset
+    monkeypatch.setattr(depth_alignment, "fit_scale_offset", lambda s: numbers.extend(len(x) for x, _ in s) or fit(s))
+    monkeypatch.setattr(alignment, "MAX_RENDERED", HEIGHT * WIDTH // 3)
+    layer = SimpleNamespace(depth=depth, alpha=torch.ones(HEIGHT, WIDTH))
+    monkeypatch.setattr(alignment, "render", lambda *_, **__: SimpleNamespace(joint=layer))
+    scene = initialize.initial_scene(CONFIG, capture, views, generator())
+    for many in (len(views) - 1, len(views)):
+        monkeypatch.setattr(alignment, "MANY", many)
+        found = alignment.align_to_rendering(torch.zeros(len(views), 2), views, scene, 0)
+        assert torch.allclose(found, torch.tensor([[2.0, 0.1]]).expand_as(found), atol=2e-3)
+    some, every = numbers[: len(views)], numbers[len(views) :]
+    assert max(some) <= HEIGHT * WIDTH // 3 < min(every)

@@ -1,5 +1,6 @@
 """The alignment of the views' depth to the scene, and how much it is trusted."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -14,11 +15,14 @@ from warpgs.data.capture import Capture
 from warpgs.data.depth_alignment import PointSamples
 from warpgs.model.scene import SplitScene
 from warpgs.rendering import DEFAULTS, render
-from warpgs.views.views import Views
+from warpgs.views.views import MANY, Views
 
 MAX_SAMPLES_ON_CPU, MAX_SAMPLES_ON_GPU = 1 << 16, 1 << 20
 """Numbers of samples that are fitted at once: as many as fit into a CPU's cache, or as keep a GPU busy for longer than
 it takes to launch its kernels."""
+
+MAX_RENDERED = 1 << 15
+"""Maximum number of pixels of each view that are compared with the rendered depth, where there are many views."""
 
 MARGIN = 3.0
 """Errors of the static depth up to this many times the relative error of the view's aligned depth at the sparse points
@@ -129,17 +133,20 @@ def align_to_rendering(
     sh_degree: int,
     settings: RenderSettings = DEFAULTS,
 ) -> Float[Tensor, "T 2"]:
-    """Scale and offset against the rendered depth; views where they cannot be determined keep their alignment."""
-    splats = scene.static_splats(sh_degree)
-    settings = replace(settings, depth=True)
-    found = []
-    for batch in _batches(views, views.num_pixels // len(views), range(len(views))):
+    """Scale and offset against the rendered depth; views where they cannot be determined keep their alignment.
+
+    Of more than ``MANY`` views a part of the rows and columns is compared.
+    """
+    splats, settings = scene.static_splats(sh_degree), replace(settings, depth=True)
+    found, pixels = [], views.num_pixels // len(views)
+    step = math.ceil(math.sqrt(pixels / MAX_RENDERED)) if len(views) > MANY else 1
+    for batch in _batches(views, pixels // step**2, range(len(views))):
         samples = []
         for view in views.each(batch):
             layer = render(splats, view.camera, settings=settings).joint
             assert layer.depth is not None
             sources = view.inverse_depth, view.static_mask, layer.depth, layer.alpha
-            samples.append(depth_alignment.sample_rendering(*sources))
+            samples.append(depth_alignment.sample_rendering(*(values[::step, ::step] for values in sources)))
         found.append(depth_alignment.fit_scale_offset(samples))
     aligned = torch.cat(found)
     return torch.where(aligned.isfinite(), aligned, alignments)
