@@ -39,6 +39,16 @@ def test_weights_sum_to_one_and_are_those_of_one_segment_between_overlaps():
     assert error(segments.weights(SEAM, NUM), torch.tensor([0.5, 0.5, 0.0])) < 1e-5
 
 
+def test_many_opaque_layers_appear_little_by_little():
+    """Ten of an opacity of 0.7, from the first to the 31st frame of an overlap of 30 frames."""
+    fractions = torch.linspace(0.0, 1.0, 31).split(1)
+    weights = [segments.weights((1.0 + segments.OVERLAP * (s - 0.5)) / NUM, NUM)[1] for s in fractions]
+    logits = torch.logit(torch.full((10,), 0.7))
+    alphas = torch.stack([1.0 - (1.0 - segments.faded(logits, w.expand(10))).prod() for w in weights])
+    assert error(alphas[[0, -1]], torch.tensor([0.0, 1.0])) < 1e-4
+    assert alphas.diff().max() < 0.15
+
+
 def test_in_an_overlap_one_segment_alone_can_be_chosen():
     for time in (SEAM, SEAM - 0.4 * segments.OVERLAP / NUM, SEAM + 0.4 * segments.OVERLAP / NUM):
         found = [segments.weights(time, NUM, torch.tensor([choice])) for choice in (-1.0, 0.0, 1.0)]

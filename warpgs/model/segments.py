@@ -2,8 +2,8 @@
 
 K segments of equal length 1 / K begin at k / K. Each is continued by half an overlap at both ends, where the opacities
 of its Gaussians fade: one of opacity o and weight w has the opacity 1 − (1 − o)ʷ. The weights of all segments sum to 1,
-so that two segments that show the same thing are as opaque as one. The network of a segment gets the time in its
-window, from 0 to 1.
+so that two segments that show the same thing are as opaque as one. In the fraction s of an overlap the weight of the
+later one is s² / (s² + (1 − s)²). The network of a segment gets the time in its window, from 0 to 1.
 """
 
 from typing import NamedTuple
@@ -64,6 +64,8 @@ def weights(time: Float[Tensor, "1"], num: int, choice: Float[Tensor, "1"] | Non
     begun = ((time * num - edges) / OVERLAP + 0.5).clamp(0.0, 1.0)
     if choice is not None:
         begun = torch.where((begun > 0.0) & (begun < 1.0), (begun + choice).clamp(0.0, 1.0), begun)
+    # At a small weight many opaque layers are opaque: with linear weights they appear from one frame to the next.
+    begun = begun**2 / (begun**2 + (1.0 - begun) ** 2)
     return torch.cat([torch.ones_like(time), begun]) - torch.cat([begun, torch.zeros_like(time)])
 
 
