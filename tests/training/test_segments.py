@@ -16,7 +16,7 @@ from warpgs.runs.config_file import read_config
 from warpgs.runs.logger import TrainingLogger
 from warpgs.runs.run import Run
 from warpgs.runtime import ranks
-from warpgs.training.density import gradient
+from warpgs.training.density import gradient, prune
 from warpgs.views.views import Views
 
 pytestmark = pytest.mark.usefixtures("quickly")
@@ -154,6 +154,19 @@ def test_dynamic_gaussians_densify_when_each_segment_was_seen_as_often_as_a_capt
     assert tiny.train(trainer)
     assert done == {"static": [9, 13, 17], "dynamic": [13]}
     assert views[0] > 4  # also those before static Gaussians were replaced
+
+
+def test_a_dynamic_gaussian_contributes_as_in_a_capture_that_is_as_long_as_its_segment(data, tmp_path, monkeypatch):
+    """Static ones have a weight of 1, dynamic ones of 0.6 in half of the views."""
+    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(CONFIG, densify=plain.densify(weakest=0.2)))
+    trainer.iteration = trainer.protocol.stage1.start
+    trainer._add_dynamic_gaussians()
+    numbers = [len(gaussians) for gaussians in (trainer.scene.static, trainer.scene.dynamic)]
+    weights = torch.cat([torch.full((num,), value) for num, value in zip(numbers, (1.0, 0.6), strict=True)])
+    monkeypatch.setattr(prune, "blend_weights", lambda *_: weights)
+    prune.prune_weakest(trainer._adaptation(tiny.plan_to(trainer, "prune_weakest"), Mock(spec=TrainingLogger)))
+    assert len(trainer.scene.dynamic) == numbers[1]
+    assert len(trainer.scene.static) < numbers[0]
 
 
 def test_an_image_has_room_for_the_dynamic_gaussians_of_its_segment(data, tmp_path):

@@ -139,7 +139,11 @@ def remove_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " 
 
 
 def prune_weakest(at: Adaptation) -> None:
-    """Removes what contributes least to the images of the training views."""
+    """Removes what contributes least to the images of the training views.
+
+    A dynamic Gaussian counts as in a capture that is as long as its segment: a K-th of the views show one of K.
+    """
     weights = blend_weights(at.scene, at.views, at.plan.phase, at.config.render_settings)
+    weights[len(at.scene.static) :] *= at.scene.num_segments
     number = remove_weakest(at.scene, at.optimizer, weights, at.config.densify.weakest)
     at.log(f"{number:,} Gaussians pruned that contribute least")
