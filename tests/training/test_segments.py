@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from tests import plain, tiny
+from warpgs.editing.contribution import blend_weights_in
 from warpgs.initialization.plan import make_plan
 from warpgs.initialization.prepare_start import prepare_again
 from warpgs.model.segments import nearest, window
-from warpgs.rendering import render
+from warpgs.rendering import DEFAULTS, render
 from warpgs.runs import checkpoint
 from warpgs.runs.config_file import read_config
 from warpgs.runs.logger import TrainingLogger
@@ -46,6 +47,21 @@ def test_dynamic_gaussians_of_each_segment_start_where_its_frames_show_them(data
         others = times[(times < start) | (times > end)]
         assert len(others)
         assert (nearest(others, 2) != segment).all()
+
+
+def test_gaussians_of_a_segment_count_by_the_images_in_which_they_are_there(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path, CONFIG)
+    trainer.iteration = trainer.protocol.stage1.start
+    trainer._add_dynamic_gaussians()
+    scene, views = trainer.scene, trainer.views
+    summed = torch.zeros(len(scene.static) + len(scene.dynamic))
+    for view in map(views.__getitem__, range(len(views))):
+        with torch.no_grad():
+            summed += blend_weights_in(scene.splats(view.time, sh_degree=1), view.camera, DEFAULTS)
+    expected = summed * torch.cat([torch.ones(len(scene.static)), 2.0 * torch.ones(len(scene.dynamic))])
+    found = prune.blend_weights(scene, views, plain.phase(stage="stage2"))
+    assert torch.allclose(found, expected, rtol=1e-5)
+    assert found[len(scene.static) :].sum() > 0.0
 
 
 def test_both_segments_are_trained_to_the_end(whole):
@@ -154,19 +170,6 @@ def test_dynamic_gaussians_densify_when_each_segment_was_seen_as_often_as_a_capt
     assert tiny.train(trainer)
     assert done == {"static": [9, 13, 17], "dynamic": [13]}
     assert views[0] > 4  # also those before static Gaussians were replaced
-
-
-def test_a_dynamic_gaussian_contributes_as_in_a_capture_that_is_as_long_as_its_segment(data, tmp_path, monkeypatch):
-    """Static ones have a weight of 1, dynamic ones of 0.6 in half of the views."""
-    trainer = tiny.trainer(data, tmp_path, dataclasses.replace(CONFIG, densify=plain.densify(weakest=0.2)))
-    trainer.iteration = trainer.protocol.stage1.start
-    trainer._add_dynamic_gaussians()
-    numbers = [len(gaussians) for gaussians in (trainer.scene.static, trainer.scene.dynamic)]
-    weights = torch.cat([torch.full((num,), value) for num, value in zip(numbers, (1.0, 0.6), strict=True)])
-    monkeypatch.setattr(prune, "blend_weights", lambda *_: weights)
-    prune.prune_weakest(trainer._adaptation(tiny.plan_to(trainer, "prune_weakest"), Mock(spec=TrainingLogger)))
-    assert len(trainer.scene.dynamic) == numbers[1]
-    assert len(trainer.scene.static) < numbers[0]
 
 
 def test_an_image_has_room_for_the_dynamic_gaussians_of_its_segment(data, tmp_path):

@@ -13,6 +13,7 @@ from warpgs.command_line.progress import progress
 from warpgs.config import RenderSettings
 from warpgs.data.capture import Capture
 from warpgs.data.sampling import evenly_spaced_indices
+from warpgs.model.scene import SplitScene
 from warpgs.model.splats import Splats
 from warpgs.rendering import render
 from warpgs.runs.trained import TrainedScene
@@ -29,7 +30,7 @@ class Contribution(NamedTuple):
     """Contributions of N Gaussians, static ones first [px].
 
     Attributes:
-        total: [N] over all images.
+        total: [N] over all images, ``as_if_always_there``.
         largest: [N] in the image in which it is largest.
     """
 
@@ -45,6 +46,16 @@ def blend_weights_in(splats: Splats, camera: Camera, settings: RenderSettings) -
     return weights
 
 
+def as_if_always_there(weights: Float[Tensor, " N"], scene: SplitScene) -> Float[Tensor, " N"]:
+    """Blend weights, summed over images of all times, of dynamic Gaussians as if they were there at all times.
+
+    One of K segments of time is there in a K-th of the images. By the plain sum, what moves in a long video would look
+    weaker than what stands still.
+    """
+    static, dynamic = weights.split([len(scene.static), len(scene.dynamic)])
+    return torch.cat([static, scene.num_segments * dynamic])
+
+
 def contribution(scene: TrainedScene, cameras: Sequence[Camera], quiet: bool = True) -> Contribution:
     """The contributions of the Gaussians of a scene to the images of cameras, each at its own time."""
     number = len(scene.scene.static) + len(scene.scene.dynamic)
@@ -54,7 +65,7 @@ def contribution(scene: TrainedScene, cameras: Sequence[Camera], quiet: bool = T
         splats = scene.splats(camera.time, camera=camera)
         weights = blend_weights_in(splats, camera, scene.config.render_settings)
         total, largest = total + weights, largest.maximum(weights)
-    return Contribution(total, largest)
+    return Contribution(as_if_always_there(total, scene.scene), largest)
 
 
 def weakest(weights: Float[Tensor, " N"], fraction: float) -> Bool[Tensor, " N"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.config import RenderSettings
-from warpgs.editing.contribution import blend_weights_in, weakest
+from warpgs.editing.contribution import as_if_always_there, blend_weights_in, weakest
 from warpgs.model.scene import SplitScene
 from warpgs.ops.adam import Adam
 from warpgs.rendering import DEFAULTS, render
@@ -103,6 +103,8 @@ def blend_weights(
 ) -> Float[Tensor, " N"]:
     """Sum of the blend weights of every Gaussian, static ones first, over the images of all views.
 
+    Dynamic ones count ``as_if_always_there``.
+
     Args:
         scene: The scene.
         views: Training views, on the scene's device.
@@ -118,7 +120,7 @@ def blend_weights(
     total = torch.zeros(len(scene.static) + len(scene.dynamic), dtype=torch.float32, device=views.device)
     for (weights,) in views.map(weights_in):
         total += weights
-    return total
+    return as_if_always_there(total, scene)
 
 
 @torch.no_grad()
@@ -139,11 +141,7 @@ def remove_weakest(scene: SplitScene, optimizer: Adam, weights: Float[Tensor, " 
 
 
 def prune_weakest(at: Adaptation) -> None:
-    """Removes what contributes least to the images of the training views.
-
-    A dynamic Gaussian counts as in a capture that is as long as its segment: a K-th of the views show one of K.
-    """
+    """Removes what contributes least to the images of the training views."""
     weights = blend_weights(at.scene, at.views, at.plan.phase, at.config.render_settings)
-    weights[len(at.scene.static) :] *= at.scene.num_segments
     number = remove_weakest(at.scene, at.optimizer, weights, at.config.densify.weakest)
     at.log(f"{number:,} Gaussians pruned that contribute least")
