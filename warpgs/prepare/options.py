@@ -32,7 +32,7 @@ class AddOptions:
         masks: A name in ``masks.MASKERS``, not "none", or a file or folder that ``data/results/masks.py`` reads.
         depth: A name in ``depth.DEPTHS``, not "none", or a file or folder that ``data/results/depth.py`` reads.
         weights: Folder with the weights of the networks; None for the Hugging Face cache.
-        tracks: A file that ``data/results/tracks.py`` reads.
+        tracks: A file or folder that ``data/results/tracks.py`` reads.
     """
 
     parts: Sequence[str]
@@ -126,7 +126,8 @@ class Prepare:
     add: str | None = None
     """Add these to a capture that lacks them: masks, depth, points and tracks, separated by commas."""
     tracks: Path | None = None
-    """With --add tracks, the .npz file of CoTracker, TAPIR or SpatialTracker for the capture's frames in full size."""
+    """With --add tracks, the .npz file of CoTracker, TAPIR or SpatialTracker, or a folder of optical flow, for the
+    capture's frames in full size."""
     options: Annotated[Options, tyro.conf.arg(name="")] = field(default_factory=Options)
     force: bool = False
     """Replace an existing capture of prepare; other files are kept."""

@@ -1,4 +1,4 @@
-"""Tracks as CoTracker, TAPIR and SpatialTracker give them."""
+"""Tracks as CoTracker, TAPIR and SpatialTracker give them, and from optical flow."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, Shaped
 
 from warpgs.data.npz import names_of, read_npz
 from warpgs.data.tracks import MAX_BYTES, VISIBLE
+
+from .flow import follow_flow
 
 LAYOUTS = (
     "pred_tracks and pred_visibility (CoTracker), tracks and visibles or occluded (TAPIR), or coords, visibs, "
@@ -32,16 +34,18 @@ class TrackedPoints(NamedTuple):
 
 
 def read_tracked_points(path: Path, size: tuple[int, int]) -> TrackedPoints:
-    """The points of an .npz file of a network.
+    """The points of an .npz file of a network, or those that the optical flow in a folder leads from frame to frame.
 
     Args:
-        path: The file.
+        path: The file, or the folder of ``follow_flow``.
         size: Width and height of the frames in which positions are wanted; those of SpatialTracker are of frames that
             it has resized.
 
     Raises:
         ValueError: If the file is damaged or of another layout, or its arrays do not fit each other.
     """
+    if path.is_dir():
+        return TrackedPoints(*follow_flow(path, size))
     with np.errstate(all="ignore"):  # positions of hidden points may be any numbers, those of visible ones are checked
         return _read(path, size)
 
