@@ -24,6 +24,17 @@ def make_scene(of_dynamic=SEGMENTS):
     return scene
 
 
+def test_whatever_segment_is_chosen_is_deformed():
+    """Also near the ends of an overlap, where a weight is so small that the other one rounds to 1."""
+    for distance in (0.0, 1e-6, 1e-4, 0.1):
+        for end in (segments.window(1, NUM)[0], segments.window(0, NUM)[1]):
+            for time in (torch.tensor([end - distance]), torch.tensor([end + distance])):
+                active = segments.active(time, NUM)
+                for choice in (-1.0, 0.0, 1.0):
+                    shown = segments.weights(time, NUM, torch.tensor([choice])).nonzero()[:, 0]
+                    assert torch.isin(shown, active).all()
+
+
 def dynamic_opacities(scene, time):
     return scene.splats(time).opacities[NUM_STATIC:]
 

@@ -60,8 +60,7 @@ def weights(time: Float[Tensor, "1"], num: int, choice: Float[Tensor, "1"] | Non
         choice: What is seen in an overlap: its earlier segment alone (-1), both (0) or the later one alone (1); both if
             None.
     """
-    edges = torch.arange(1, num, device=time.device)
-    begun = ((time * num - edges) / OVERLAP + 0.5).clamp(0.0, 1.0)
+    begun = _begun(time, num)
     if choice is not None:
         begun = torch.where((begun > 0.0) & (begun < 1.0), (begun + choice).clamp(0.0, 1.0), begun)
     # At a small weight many opaque layers are opaque: with linear weights they appear from one frame to the next.
@@ -69,12 +68,21 @@ def weights(time: Float[Tensor, "1"], num: int, choice: Float[Tensor, "1"] | Non
     return torch.cat([torch.ones_like(time), begun]) - torch.cat([begun, torch.zeros_like(time)])
 
 
+def _begun(time: Float[Tensor, "1"], num: int) -> Float[Tensor, " edges"]:
+    """Fraction done of the overlap at each of the ``num`` - 1 edges."""
+    edges = torch.arange(1, num, device=time.device)
+    return ((time * num - edges) / OVERLAP + 0.5).clamp(0.0, 1.0)
+
+
 def active(time: Float[Tensor, "1"], num: int) -> Int64[Tensor, " A"]:
-    """The two segments, of ``num`` > 1, that may have a weight at a time; on the CPU those that have one."""
+    """The two segments, of ``num`` > 1, that may have a weight at a time; on the CPU those that a choice may show."""
     later = (time * num).round().long().clamp(1, num - 1)
     pair = torch.cat([later - 1, later])
     # A CUDA graph needs one shape for all times. On the CPU the other segment would only cost time.
-    return pair if time.is_cuda else pair[weights(time, num)[pair] > 0.0]
+    if time.is_cuda:
+        return pair
+    begun = _begun(time, num)[later - 1]  # near an end, the weights of both round to 0 and 1
+    return pair[torch.cat([begun < 1.0, begun > 0.0])]
 
 
 def faded(logits: Float[Tensor, " D"], weight: Float[Tensor, " D"]) -> Float[Tensor, " D"]:
