@@ -81,9 +81,8 @@ def test_a_training_has_the_same_bits(data, tmp_path, monkeypatch, in_double, pr
         warpgs.train(dataclasses.replace(config, out=tmp_path / str(dtype)))
     runs = [tmp_path / str(dtype) for dtype in (torch.float32, torch.float64)]
     assert tiny.differences(tiny.state(runs[0]), tiny.state(runs[1])) == []
-    assert all(
-        t.dtype == torch.float32 for t in checkpoint.load(checkpoint.list_checkpoints(runs[1])[-1]).tensors.values()
-    )
+    tensors = checkpoint.load(checkpoint.list_checkpoints(runs[1])[-1]).tensors.values()
+    assert {t.dtype for t in tensors if t.is_floating_point()} == {torch.float32}
 
 
 def test_a_built_in_capture_has_the_same_bits(data, tmp_path, in_double):

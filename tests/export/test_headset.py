@@ -230,9 +230,9 @@ def test_the_left_thumbstick_walks_where_the_head_looks_until_the_view_leaves_wh
 def test_the_thumbsticks_end_near_what_was_filmed(emulated, baked, tmp_path):
     entered(emulated, tmp_path, baked, start(filmed=FILMED))
     tilt(emulated, "left", 1, 0)
-    before = None
-    while before != (before := emulated.value(f"{SETTLED}.then(() => headset.stage.origin[0])")):
-        pass
+    seen = []  # a busy machine may draw no frame between two looks
+    while len(seen) < 5 or len(set(seen[-5:])) > 1:
+        seen.append(emulated.value(f"{SETTLED}.then(() => headset.stage.origin[0])"))
     assert 0.8 * DRAG_LIMIT < emulated.value("outsideOf(FILMED, headset.stage.camera(headset.head))") <= DRAG_LIMIT
 
 

@@ -360,16 +360,20 @@ def test_results_in_full_size_are_written_one_by_one_after_all_were_checked(root
     events, read, write = [], getattr(add, f"read_{plural}"), getattr(add.writer, f"write_{part}")
     array = option = "masks" if part == "mask" else "depth"
 
-    def reading(path, names, sizes):
-        for name, result in zip(names, read(path, names, sizes), strict=True):
-            events.append(name)
-            yield result
+    class Reading:
+        def __init__(self, path, names, sizes):
+            self.names, self.results = names, read(path, names, sizes)
+
+        def __iter__(self):
+            for name, result in zip(self.names, self.results, strict=True):
+                events.append(name)
+                yield result
 
     def writing(root, name, *arguments):
         events.append(f"write {name}")
         write(root, name, *arguments)
 
-    monkeypatch.setattr(add, f"read_{plural}", reading)
+    monkeypatch.setattr(add, f"read_{plural}", Reading)
     monkeypatch.setattr(add.writer, f"write_{part}", writing)
     np.savez(tmp_path / "results.npz", **{array: np.ones((COUNT, 96, 128), np.float32)})
     add_parts(root, AddOptions([option], **{option: str(tmp_path / "results.npz")}))

@@ -98,7 +98,7 @@ def test_depth_gets_no_gradient_by_making_pixels_larger():
 
 
 def test_cameras_get_no_gradient_by_moving_away():
-    poses = PoseCorrections(1, 1.0)
+    poses = PoseCorrections(torch.zeros(1, dtype=torch.int64), 1.0)
     measured(accelerated(2.0).requires_grad_(), poses.moved(CAMERA, torch.tensor([0]))).backward()
     assert all(parameter.grad is None for parameter in poses.parameters())
 
