@@ -105,6 +105,16 @@ def test_parameters_may_have_any_shape_and_gradients_any_strides(gradient):
     assert torch.allclose(parameter.detach(), -0.5 * gradient.sign(), rtol=1e-6)
 
 
+@pytest.mark.parametrize("values", [torch.zeros(4, 3).T, torch.zeros(5, dtype=torch.float64)])
+def test_the_kernel_refuses_what_it_would_read_as_other_numbers(values, monkeypatch):
+    monkeypatch.setattr(Adam, "_step_on_cpu", Adam._launch)
+    parameter = values.requires_grad_()
+    parameter.grad = torch.ones_like(values)
+    with pytest.raises(ValueError, match=r"Adam needs contiguous torch\.float32, got torch\.float"):
+        Adam([{"params": [parameter], "lr": torch.tensor(0.1)}]).step()
+    assert not parameter.any()
+
+
 SIZES = [0, 1, 7, BLOCK, BLOCK * PER_THREAD + 1, 3 * BLOCK * PER_THREAD - 5, *[3] * MAX_PARAMETERS]
 
 

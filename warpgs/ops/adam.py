@@ -80,7 +80,7 @@ class Adam:
             gradients[0].new_empty(len(trained), 2, dtype=torch.int32),
             gradients[0].new_empty(len(trained), 3),
         )
-        addresses = [_padded([tensor.data_ptr() for tensor in column]) for column in tensors]
+        addresses = [_padded([_address(tensor) for tensor in column]) for column in tensors]
         (beta1, beta2), counts = self.betas, (_padded(sizes), _padded(ends))
         launch(kernels.adam_begin, len(trained), *table, *addresses, *counts, math.log(beta1), math.log(beta2))
         launch(kernels.adam_step, ends[-1], *table, beta1, 1.0 - beta1, beta2, 1.0 - beta2, self.epsilon)
@@ -111,6 +111,13 @@ class Adam:
         for group in self.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None
+
+
+def _address(tensor: torch.Tensor) -> int:
+    """Where the numbers of a tensor are, of which kernels see nothing else."""
+    if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+        raise ValueError(f"Adam needs contiguous torch.float32, got {tensor.dtype}, strides {list(tensor.stride())}")
+    return tensor.data_ptr()
 
 
 def _padded(numbers: Sequence[int]) -> tuple[int, ...]:
