@@ -60,7 +60,7 @@ def make_plan(config: TrainConfig, capture: Capture) -> Planned:
     num_poses = int(shared_places([capture.cameras[name] for name in capture.train]).max()) + 1
     poses = config.optim.poses * min(1.0, num_poses / MANY_POSES)
     if poses < config.optim.poses:
-        notes.append(f"corrections of poses learn at {poses:.1e}: each of {counted(num_poses, 'pose')} is seen often")
+        notes.append(f"corrections of {counted(num_poses, 'pose')} learn at {poses:.1e}: each is seen often")
         config = dataclasses.replace(config, optim=dataclasses.replace(config.optim, poses=poses))
     branches = loss.branches_in_stage2 != "no"
     if loss.branches_in_stage2 == "given-masks" and capture.assuming(config.assumption).uses_estimated_masks:
