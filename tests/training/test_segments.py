@@ -172,6 +172,22 @@ def test_dynamic_gaussians_densify_when_each_segment_was_seen_as_often_as_a_capt
     assert views[0] > 4  # also those before static Gaussians were replaced
 
 
+@pytest.mark.parametrize("waits", [True, False])
+def test_dynamic_gaussians_that_wait_keep_their_part_of_the_capacity(data, tmp_path, monkeypatch, waits):
+    config = dataclasses.replace(CONFIG, densify=dataclasses.replace(CONFIG.densify, max_gaussians=100))
+    trainer, limits = tiny.trainer(data, tmp_path, config), []
+    trainer.iteration = trainer.protocol.stage1.start
+    trainer._add_dynamic_gaussians()
+    trainer.step.density.total += 1.0  # all Gaussians want to grow
+    monkeypatch.setattr(gradient, "densify", lambda *arguments: limits.append(arguments[4].capacity))
+    plan = dataclasses.replace(tiny.plan_to(trainer, "densify"), densifies_dynamic=not waits)
+    trainer.step.density.densify(trainer._adaptation(plan, Mock(spec=TrainingLogger)))
+    numbers = len(trainer.scene.static), len(trainer.scene.dynamic)
+    left = 100 - sum(numbers)
+    assert left > 0
+    assert limits == [left * num // sum(numbers) for num in numbers][: 1 if waits else 2]
+
+
 def test_an_image_has_room_for_the_dynamic_gaussians_of_its_segment(data, tmp_path):
     config = dataclasses.replace(CONFIG, densify=dataclasses.replace(CONFIG.densify, max_gaussians=10**6, min_pixels=8))
     trainer = tiny.trainer(data, tmp_path, config)

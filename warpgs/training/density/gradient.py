@@ -106,16 +106,16 @@ class GradientStrategy(Strategy):
     def densify(self, at: Adaptation) -> None:
         """Both branches divide the remaining capacity in proportion to how many Gaussians want to grow.
 
-        The dynamic one waits for ``IterationPlan.densifies_dynamic``. Oversized Gaussians are removed once opacities
-        have been reset, as in 3DGS.
+        The dynamic one waits for ``IterationPlan.densifies_dynamic``; its part is left to it until then. Oversized
+        Gaussians are removed once opacities have been reset, as in 3DGS.
         """
         config, branches = at.config.densify, (at.scene.static, at.scene.dynamic)
         numbers = [len(gaussians) for gaussians in branches]
         means, units = self.mean().split(numbers), self.units(at).split(numbers)
         generator, capacity = at.generator("densify"), at.capacity
         remove_large = at.plan.done > at.config.schedule.reset_every
-        due = [*zip(branches, means, units, strict=True)][: 1 + at.plan.densifies_dynamic]
-        candidates = [int((gradients > config.gradient).sum()) for _, gradients, _ in due]
-        for (gaussians, gradients, unit), count in zip(due, candidates, strict=True):
+        candidates = [int((gradients > config.gradient).sum()) for gradients in means]
+        due = [*zip(branches, means, units, candidates, strict=True)][: 1 + at.plan.densifies_dynamic]
+        for gaussians, gradients, unit, count in due:
             limits = Limits(unit, capacity * count // max(1, sum(candidates)), remove_large)
             densify(gaussians, at.optimizer, gradients, config, limits, generator)
