@@ -112,8 +112,9 @@ def test_cameras_that_stand_still_have_no_depth_and_each_has_rows_of_thumbnails(
 def test_the_report_says_which_cameras_move_and_when_they_start(made):
     report = json.loads((made / "prepare.json").read_text())
     assert report["steps"]["frames"] == (
-        "17 of 320×180 of 0, which moves; 17 of 320×180 of 1, which stands still; 17 of 320×180 of 2, which stands "
-        "still; the videos start at a.mp4 0.000 s, b.mp4 0.370 s, c.mp4 0.810 s, from their sound"
+        "17 of 320×180 of a.mp4 (0), which moves; 17 of 320×180 of b.mp4 (1), which stands still; "
+        "17 of 320×180 of c.mp4 (2), which stands still; "
+        "the videos start at a.mp4 0.000 s, b.mp4 0.370 s, c.mp4 0.810 s, from their sound"
     )
     assert report["source"] == [str(made.parent / f"{name}.mp4") for name in "abc"]
 

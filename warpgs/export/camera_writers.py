@@ -48,7 +48,10 @@ def write_cameras(folder: Path, name: str, cameras: CameraSet) -> str:
 
 CAMERA_FORMATS: dict[str, CameraFormat] = {
     "colmap": CameraFormat(
-        write_colmap, "world to camera, x right, y down, z forward; COLMAP has no times: ids follow them", True
+        write_colmap,
+        "world to camera, x right, y down, z forward; COLMAP has no times: ids follow them. "
+        "For render --cameras, export them with --up scene",
+        True,
     ),
     "nerfstudio": CameraFormat(write_nerfstudio, "camera to world, x right, y up, z backward; times from 0 to 1", True),
     "blender": CameraFormat(

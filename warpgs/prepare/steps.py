@@ -107,9 +107,9 @@ def _take(sources: Sequence[Path], folder: Path, options: Options, journal: Jour
     clock, starts = common_clock(sources, options.offsets, journal.quiet)
     videos = take_videos(sources, folder, options.selection, clock, journal.quiet, journal.notes)
     taken = [
-        f"{len(video.taken)} of {video.width}×{video.height} of {video.prefix}, "
+        f"{len(video.taken)} of {video.width}×{video.height} of {source.name} ({video.prefix}), "
         f"{'which stands still' if video.is_still else 'which moves'}"
-        for video in videos
+        for source, video in zip(sources, videos, strict=True)
     ]
     return videos, f"{'; '.join(taken)}; {starts}"
 

@@ -107,6 +107,12 @@ def test_colmap_ends_when_the_process_that_started_it_ends(tmp_path):
     assert process.returncode == 1
 
 
+@pytest.mark.parametrize(("num_cameras", "advice"), [(1, "move the camera sideways"), (2, "at most 20° apart")])
+def test_the_advice_where_no_two_frames_match_suits_the_number_of_cameras(num_cameras, advice):
+    assert advice in colmap.unmatched(num_cameras)
+    assert ("move the camera" in colmap.unmatched(num_cameras)) == (num_cameras == 1)
+
+
 def test_frames_are_matched_with_the_next_ones_and_at_powers_of_two():
     assert sequence_pairs(3) == all_pairs(3) == [(0, 1), (0, 2), (1, 2)]
     assert [b for a, b in sequence_pairs(100) if a == 0] == [*range(1, 11), 16, 32, 64]

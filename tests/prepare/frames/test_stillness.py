@@ -2,6 +2,7 @@
 
 import tracemalloc
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,6 +18,31 @@ def write(folder, **options):
 
 def test_a_camera_on_a_tripod_stands_still_whatever_moves_before_it(tmp_path):
     assert stands_still(write(tmp_path, path=boards.still_pose), NAMES)
+
+
+def texture(shape, contrast, blur, seed):
+    """Noise of blobs, [H, W, 3]."""
+    noise = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=shape), (0, 0), blur)
+    grey = (128 + contrast * noise / np.abs(noise).max()).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, 2)
+
+
+def test_a_camera_stands_still_if_what_moves_has_most_of_the_texture(tmp_path):
+    """A checkered ball before a wall, near enough to fill most of the image."""
+    wall, ball = texture((270, 480), 60, 3.0, 0), texture((200, 240), 120, 2.0, 1)
+    frames = []
+    for k in range(12):
+        frames.append(wall.copy())
+        left = 20 + 18 * k
+        frames[-1][40:240, left : left + 240] = np.roll(ball, 11 * k, axis=1)
+    assert stands_still(boards.write_folder(tmp_path, frames), NAMES)
+
+
+def test_a_clock_that_is_burned_in_does_not_make_a_camera_stand_still(tmp_path):
+    images = boards.record(12)[0]
+    for k, image in enumerate(images):
+        cv2.putText(image, f"2026-11-28 12:34:{k:02d}", (4, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (255, 255, 255))
+    assert not stands_still(boards.write_folder(tmp_path, images), NAMES)
 
 
 @pytest.mark.parametrize("options", [{}, {"travel": 0.1}, {"path": boards.turning_pose}])

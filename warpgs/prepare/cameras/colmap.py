@@ -58,16 +58,24 @@ def run(job: Job, report: Report) -> list[Cameras]:
         if model is not None and job.thorough:
             model = refine(done, model, report)
     if model is None:
-        raise NoCamerasError(
-            "no two frames show enough of the same static surfaces from different positions: move the camera sideways, "
-            "slower and past textured objects, or take frames closer in time (--fps, --count)"
-        )
+        raise NoCamerasError(unmatched(len(job.groups)))
     if not job.refine:
         model_folder.mkdir(exist_ok=True)
         model.write(model_folder)
     groups = [[job.names[k] for k in group] for group in job.groups]
     found = cameras_of_model(model, groups, job.sources, job.weak_features)
     return [replace(camera, has_held_focal=done.focal != job.focal) for camera in found]
+
+
+def unmatched(num_cameras: int) -> str:
+    """Why frames have no cameras if no two of them match, and what to do."""
+    advice = (
+        "move the camera sideways, slower and past textured objects, or take frames closer in time (--fps, --count)"
+        if num_cameras == 1
+        else "put neighbouring cameras at most 20° apart, with texture in view, keep more pixels (--longest-side), or "
+        "add a video that walks past what all of them see"
+    )
+    return f"no two frames show enough of the same static surfaces from different positions: {advice}"
 
 
 def _check_parallax(job: Job, database: Path) -> None:
