@@ -199,6 +199,11 @@ def test_a_path_that_is_not_a_run_folder_is_refused(tmp_path, name, problem):
         read_config(tmp_path / name)
 
 
+def test_a_capture_is_not_a_run_folder_but_can_be_trained_on(data):
+    with pytest.raises(ValueError, match=f"{data} is not a run folder: .* capture: warpgs train --data {data} trains"):
+        read_config(data)
+
+
 def test_a_folder_with_files_is_not_trained_into(tmp_path, capture):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match=rf"{tmp_path} exists and is not empty: choose another --out"):

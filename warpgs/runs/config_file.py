@@ -11,7 +11,7 @@ from typing import Any
 
 from warpgs.config import Plan, TrainConfig, validate
 from warpgs.config.builtin import is_builtin
-from warpgs.errors import missing, suggestion
+from warpgs.errors import command, missing, suggestion
 from warpgs.files import read_json, write_text
 
 from .former import FORMER, RENAMED, as_today, not_kept
@@ -80,7 +80,10 @@ def read_config(folder: Path) -> Plan:
     if not folder.exists():
         raise ValueError(missing(folder))
     if not path.exists():
-        raise ValueError(f"{folder} is not a run folder: it has no {NAME}")
+        from warpgs.data.loaders import is_capture  # imports torch
+
+        capture = f"; it is a capture: {command('train', '--data', folder)} trains on it" * is_capture(folder)
+        raise ValueError(f"{folder} is not a run folder: it has no {NAME}{capture}")
     written = read_json(path, max_bytes=MAX_BYTES)
     try:
         values = as_today(written)
