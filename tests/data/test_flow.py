@@ -83,7 +83,7 @@ def test_points_are_lost_where_flow_back_leads_elsewhere_or_the_mask_says_so(tmp
     assert (positions[through, 6, 1] > 23.5).all()
 
 
-def test_at_most_so_many_points_are_kept_from_all_parts_of_the_film(tmp_path, monkeypatch):
+def test_the_number_of_tracks_is_bounded_and_they_span_the_video(tmp_path, monkeypatch):
     write(tmp_path / "flow", ".npy")
     everything = read_tracked_points(tmp_path / "flow", (WIDTH, HEIGHT))
     monkeypatch.setattr(flow, "MAX_TRACKS", 100)

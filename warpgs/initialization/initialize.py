@@ -38,8 +38,8 @@ def initial_scene(
 ) -> SplitScene:
     """Static Gaussians at the sparse points (at random ones in the scene's box if there are none), no dynamic ones yet.
 
-    If everything is assumed to be dynamic, there are no static Gaussians either. The sky gets none, where depth tells
-    it (``sky``).
+    If everything is assumed to be dynamic, there are no static Gaussians either. Points in the sky (``sky``, found from
+    depth) get none.
     """
     dome = None
     if config.background == "sky":

@@ -27,7 +27,7 @@ def texture(shape, contrast, blur, seed):
     return np.repeat(grey[..., None], 3, 2)
 
 
-def test_a_camera_stands_still_if_what_moves_has_most_of_the_texture(tmp_path):
+def test_a_still_camera_is_found_where_moving_objects_have_most_texture(tmp_path):
     """A checkered ball before a wall, near enough to fill most of the image."""
     wall, ball = texture((270, 480), 60, 3.0, 0), texture((200, 240), 120, 2.0, 1)
     frames = []

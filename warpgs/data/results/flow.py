@@ -23,7 +23,7 @@ CELLS = 96
 """Number of cells along the longer side of a frame, in each of which some point is followed."""
 
 MIN_FRAMES = 8
-"""Minimum number of frames, of a longer film, through which a point must be followed."""
+"""Minimum number of frames, of a longer video, through which a point must be followed."""
 
 MAX_TRACKS = 20_000
 """Maximum number of points."""
