@@ -49,6 +49,12 @@ def test_a_good_capture_is_fit_without_warnings_in_a_report_of_plain_json(root):
     assert {finding["level"] for finding in plain["findings"]} == {"note"}
 
 
+def test_a_single_training_frame_is_said_to_show_no_motion(root):
+    capture = load_capture(root)
+    warnings = [f.text for f in check_counts(capture.split(capture.train[:1], ())) if f.level == "warning"]
+    assert warnings == ["1 training frame shows no motion: give frames of other moments"]
+
+
 @pytest.mark.parametrize(("dataset", "masks", "depth"), [("nerfds", 6, 0), ("hypernerf", 0, 0), ("iphone", 0, 4)])
 def test_every_dataset_is_read_completely(tmp_path, dataset, masks, depth):
     notes = texts(check_capture(captures.write_capture(tmp_path / "toy", dataset)), "note")

@@ -210,8 +210,14 @@ def test_portrait_and_landscape_have_one_view_size():
 
 
 def test_a_capture_without_training_frames_is_refused():
-    with pytest.raises(ValueError, match="c has no frames to train on"):
+    with pytest.raises(ValueError, match="c has no frames to train on: give train the ids of some"):
         make_capture(train=())
+
+
+def test_frames_are_not_all_held_out():
+    capture = make_capture()[0]
+    with pytest.raises(ValueError, match="c has no frames to train on: give train the ids of some"):
+        capture.split([], capture.train)
 
 
 SOME_STATIC = torch.tensor([[True, False, True, True], [True, True, False, True]])

@@ -80,6 +80,7 @@ DAMAGES = [
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", train_filenames=["x.png"]), r"x\.png is missing"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", train_filenames=["points.ply"]), "which is not a frame"),
     ("nerfstudio", lambda r: edit_json(r / "transforms.json", val_filenames=7), "must be a list of files"),
+    ("nerfstudio", lambda r: edit_json(r / "transforms.json", val_filenames=[]), "train_filenames must list some"),
     ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", file_path=None), "no file_path"),
     ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", file_path=7), "must name a file, got 7"),
     ("nerfstudio", lambda r: edit_transforms(r / "transforms.json", file_path="/dev/zero"), "is missing"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.data.captures import edit_json, refused, write_array, write_json
+from tests.data.captures import edit_json, refused, write_array, write_capture, write_json
 from warpgs.captures.opening import load_capture
 from warpgs.config import MaskPerturbation
 from warpgs.data.writer import FINISHED, STATE, WORK
@@ -151,6 +151,18 @@ def test_a_bad_option_is_refused_on_opening(root, options, message):
 def test_bad_training_ids_are_refused(root, ids):
     edit_json(root / "dataset.json", train_ids=ids)
     refused(root, r"dataset\.json")
+
+
+@pytest.mark.parametrize(("val", "some"), [([], "some$"), (["right_000000"], "some of the 1 frame to evaluate on")])
+def test_without_training_frames_the_list_that_lacks_them_is_named(root, val, some):
+    edit_json(root / "dataset.json", train_ids=None, val_ids=val)
+    refused(root, rf"dataset\.json has no frames to train on: its train_ids must list {some}")
+
+
+def test_a_split_of_an_iphone_without_training_frames_is_named(tmp_path):
+    root = write_capture(tmp_path / "toy", "iphone")
+    write_json(root / "splits/train.json", {"frame_names": []})
+    refused(root, r"splits.train\.json has no frames to train on: its frame_names must list some of the 2 frames to")
 
 
 @pytest.mark.parametrize("step", [None, -1, float("nan"), "first", True])

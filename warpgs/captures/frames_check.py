@@ -35,15 +35,16 @@ def check_counts(capture: Capture) -> Iterator[Finding]:
             yield Finding("warning", "time", text)
         else:
             yield Finding("error", "time", f"{text}; train a scene without motion with --assume static")
-    elif times[-1] - times[0] < 0.5:
+    elif len(times) > 1 and times[-1] - times[0] < 0.5:
         yield Finding("warning", "time", "training frames cover less than half of the time range")
     late = [n for n in capture.val if not times[0] <= capture.cameras[n].time <= times[-1]]
     if late:
         number = "1 evaluation frame lies" if len(late) == 1 else f"{len(late)} evaluation frames lie"
         yield Finding("warning", "time", f"{number} before or after all training frames")
-    if len(capture.train) < 10:
-        number = "1 training frame is" if len(capture.train) == 1 else f"{len(capture.train)} training frames are"
-        yield Finding("warning", "counts", f"{number} very few")
+    if len(times) == 1:
+        yield Finding("warning", "counts", "1 training frame shows no motion: give frames of other moments")
+    elif len(times) < 10:
+        yield Finding("warning", "counts", f"{len(times)} training frames are very few")
 
 
 def check_files(capture: Capture, contents: Mapping[str, Content]) -> Iterator[Finding]:

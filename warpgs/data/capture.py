@@ -178,12 +178,15 @@ class Capture:
     has_empty: bool = field(init=False)
 
     def __post_init__(self) -> None:
-        if not self.train:
-            raise ValueError(f"{self.name} has no frames to train on")
-        self.train, self.val, self.notes = tuple(self.train), tuple(self.val), tuple(self.notes)
+        self._choose(self.train, self.val)
+        self.notes, self._moved = tuple(self.notes), frozenset[str]()
         self.assumption, self.has_empty = self.unmasked, self.background == "white"
-        self._moved: frozenset[str] = frozenset()
         self._make_cache()
+
+    def _choose(self, train: Sequence[str], val: Sequence[str]) -> None:
+        if not train:
+            raise ValueError(f"{self.name} has no frames to train on: give train the ids of some")
+        self.train, self.val = tuple(train), tuple(val)
 
     def _make_cache(self) -> None:
         largest = max(camera.width * camera.height for camera in self.cameras.values())
@@ -293,9 +296,9 @@ class Capture:
         return capture
 
     def split(self, train: Sequence[str], val: Sequence[str]) -> "Capture":
-        """The same capture with other frames to train and to evaluate on; the captures have one cache of frames."""
+        """The same capture with other frames; raises as the constructor. The captures have one cache of frames."""
         capture = copy.copy(self)
-        capture.train, capture.val = tuple(train), tuple(val)
+        capture._choose(train, val)
         capture._forget_measures()
         return capture
 

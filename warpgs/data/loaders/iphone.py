@@ -37,7 +37,7 @@ class IPhoneLoader(NerfiesLoader):
         train_path, val_path = root / "splits/train.json", root / "splits/val.json"
         if train_path.is_file():
             train, val = (read_ids(path, read_json(path), "frame_names") for path in (train_path, val_path))
-            return Split(train_path, train, val)
+            return Split(train_path, train, val, "frame_names")
         if split.train:
             return split
         ids = read_ids(split.source, dataset, "ids")

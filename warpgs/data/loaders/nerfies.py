@@ -28,7 +28,7 @@ from warpgs.data.points import read_points
 from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.units import SceneUnits, read_units
 from warpgs.data.writer import ESTIMATED, GIVEN, is_plain_id
-from warpgs.errors import command
+from warpgs.errors import command, counted
 from warpgs.files import read_json, read_numbers
 
 from .listed import ListedFiles, find_file
@@ -47,11 +47,12 @@ MAX_NAME = 200
 
 
 class Split(NamedTuple):
-    """Ids of the frames to train on and to evaluate on, and the file that lists them, for messages."""
+    """Ids of the frames to train on and to evaluate on; the file and its field that list the former, for messages."""
 
     source: Path
     train: list[str]
     val: list[str]
+    field: str = "train_ids"
 
 
 class NerfiesLoader(ABC):
@@ -167,7 +168,8 @@ def metadata_field(metadata: dict[str, Any], name: str, key: str) -> Any:
 
 def _check_split(split: Split) -> None:
     if not split.train:
-        raise ValueError(f"{split.source} has no frames to train on")
+        some = f"some of the {counted(len(split.val), 'frame')} to evaluate on instead" if split.val else "some"
+        raise ValueError(f"{split.source} has no frames to train on: its {split.field} must list {some}")
     if both := set(split.train) & set(split.val):
         raise ValueError(f"{split.source}: frame {min(both)} is listed for both training and evaluation")
 

@@ -125,6 +125,11 @@ def _evaluated(transforms: Transforms, names: dict[Path, str]) -> tuple[set[str]
             raise ValueError(f"{transforms.path}: {key}_filenames lists {unknown}, which is not a frame")
         chosen[key] = {names[path.resolve()] for path in paths if path is not None}
     held_out = chosen["val"] | chosen["test"]
+    if not chosen["train"]:
+        raise ValueError(
+            f"{transforms.path} has no frames to train on: train_filenames must list some, beside val_filenames and "
+            "test_filenames; without the three, every eighth frame is for evaluation"
+        )
     if both := held_out & chosen["train"]:
         raise ValueError(f"{transforms.path}: frame {min(both)} is listed for both training and evaluation")
     return held_out, {*names.values()} - held_out - chosen["train"]
