@@ -36,6 +36,13 @@ def test_a_second_pass_is_used_unless_it_omits_many_frames(steps, monkeypatch, k
     assert [note.endswith(reason) for note in steps.journal.notes] == [True] * (used != kept)
 
 
+def test_the_video_that_loses_many_frames_in_the_second_pass_is_named(steps, monkeypatch):
+    videos = [dataclasses.replace(steps.videos[0], source=f"{name}.mp4") for name in "ab"]
+    monkeypatch.setattr(module, "recover_several", lambda *job: [with_frames(10), with_frames(7)])
+    dataclasses.replace(steps, videos=videos).refine("cameras", [FIRST, FIRST], Masks())
+    assert steps.journal.notes[0].endswith(r"only 7 of 10 frames of b.mp4 have a camera")
+
+
 @pytest.mark.parametrize("found", [4, 5])
 def test_half_of_all_frames_need_a_camera_even_if_some_were_omitted_before(steps, monkeypatch, found):
     monkeypatch.setattr(module, "recover_cameras", lambda *job: with_frames(found))

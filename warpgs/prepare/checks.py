@@ -13,7 +13,7 @@ from .depth.methods import DEPTHS
 from .frames.offsets import check_offsets
 from .frames.take import Frames, check_selection
 from .masks.methods import MASKERS
-from .options import Options
+from .options import MIN_FRAMES, Options
 from .weights import find_weights
 
 MIN_FOR_MOTION = 10
@@ -138,6 +138,11 @@ def _check_networks(options: Options) -> None:
         find_weights(network, options.weights)
 
 
+def needed_frames(options: Options) -> int:
+    """Number of frames that each video must give."""
+    return MIN_FRAMES if MASKERS.get(options.masks) is None else MIN_FOR_MOTION
+
+
 def check_frames(videos: Sequence[Frames], options: Options) -> None:
     """Checks that the options are possible with the frames of some videos.
 
@@ -156,7 +161,7 @@ def check_frames(videos: Sequence[Frames], options: Options) -> None:
                 f"{video.width}×{video.height}: export the whole sphere from the camera's program"
             )
         count, whose = len(video.taken), f" of {video.source}" if len(videos) > 1 else ""
-        if MASKERS.get(options.masks) is not None and count < MIN_FOR_MOTION:
+        if count < needed_frames(options):
             raise ValueError(
                 f"{count} frames{whose} are too few to find what moves, at least {MIN_FOR_MOTION} are needed: take "
                 "more (--fps, --count), or give masks of what moves (--masks FOLDER, --masks none if nothing does)"

@@ -26,7 +26,7 @@ from .cameras.recovered import (
     save_all,
 )
 from .cameras.sfm import Settings, Shots, recover_cameras, recover_several
-from .checks import check_frames
+from .checks import check_frames, needed_frames
 from .depth.estimate import add_depth, depth_files
 from .depth.methods import DEPTHS
 from .doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
@@ -104,7 +104,7 @@ def _take(sources: Sequence[Path], folder: Path, options: Options, journal: Jour
         if video.width == 2 * video.height and not options.has_panoramas:
             journal.notes.append(MAYBE_PANORAMAS)
         return [video], f"{len(video.taken)} of {video.width}×{video.height}"
-    clock, starts = common_clock(sources, options.offsets, journal.quiet)
+    clock, starts = common_clock(sources, options.offsets, journal.quiet, needed_frames(options))
     videos = take_videos(sources, folder, options.selection, clock, journal.quiet, journal.notes)
     taken = [
         f"{len(video.taken)} of {video.width}×{video.height} of {source.name} ({video.prefix}), "
@@ -170,12 +170,16 @@ class Steps:
                 return _save(first, path, names_of(first))
             try:
                 found = self._reconstruct(names_of(first), settings)
-                counts = [(len(new.names), len(old.names)) for new, old in zip(found, first, strict=True)]
-                kept, of = min(counts, key=lambda count: count[0] / count[1])
+                counts = [
+                    (len(new.names), len(old.names), video.source)
+                    for new, old, video in zip(found, first, self.videos, strict=True)
+                ]
+                kept, of, source = min(counts, key=lambda count: count[0] / count[1])
                 if kept >= MIN_KEPT * of:
                     held = first[0].has_held_focal
                     return _save([replace(camera, has_held_focal=held) for camera in found], path, names_of(first))
-                reason = f"only {kept} of {of} frames have a camera"
+                whose = f" of {source}" if len(first) > 1 else ""
+                reason = f"only {kept} of {of} frames{whose} have a camera"
             except NoCamerasError as error:
                 reason = str(error)
             # The static regions were sufficient for the first pass; its cameras are as good as without masks.

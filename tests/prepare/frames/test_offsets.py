@@ -1,5 +1,6 @@
 """When several videos start, from their sound or as given."""
 
+import contextlib
 from fractions import Fraction
 from pathlib import Path
 
@@ -121,6 +122,29 @@ def test_a_video_whose_sound_does_not_tell_when_it_starts_is_named(tmp_path, see
     videos = [write(tmp_path / "a.mp4", 3.0), write(tmp_path / "b.mp4", 3.37), write(tmp_path / "c.mp4", 3, seed=seed)]
     with pytest.raises(ValueError, match=message):
         common_clock(videos, None)
+
+
+def test_a_first_video_of_another_event_is_named(tmp_path):
+    videos = [write(tmp_path / "a.mp4", 3, seed=5), write(tmp_path / "b.mp4", 3.0), write(tmp_path / "c.mp4", 3.37)]
+    with pytest.raises(
+        ValueError, match=r"the sound of .*a\.mp4 does not .* \(found: b\.mp4 0\.00 s, c\.mp4 0\.37 s\)"
+    ):
+        common_clock(videos, None)
+
+
+def test_of_two_videos_that_hear_different_things_both_are_named(tmp_path):
+    videos = [write(tmp_path / "a.mp4", 3.0), write(tmp_path / "b.mp4", 3.37, seed=5)]
+    with pytest.raises(ValueError, match=r"the sounds of .*a\.mp4 and .*b\.mp4 do not tell when they start: give"):
+        common_clock(videos, None)
+
+
+@pytest.mark.parametrize(("needed", "is_refused"), [(3, False), (4, True)])
+def test_a_video_that_ends_too_early_is_named_whichever_it_is(tmp_path, needed, is_refused):
+    short = event.write_video(tmp_path / "short.mp4", IMAGES[:3])
+    for videos in ([write(tmp_path / "a.mp4", 0, seed=None), short], [short, write(tmp_path / "a.mp4", 0, seed=None)]):
+        message = r"the videos show only 0\.25 s together, the length of .*short\.mp4: 3 frames of .*, at least 4 are"
+        with pytest.raises(ValueError, match=message) if is_refused else contextlib.nullcontext():
+            common_clock(videos, [0.0, 0.0], needed=needed)
 
 
 def test_sounds_too_short_to_compare_other_lags_tell_nothing():

@@ -49,12 +49,15 @@ def require_cameras(counts: Sequence[int], of: Sequence[int], sources: Sequence[
         of: Number of its frames.
         sources: Its video, for the message.
     """
+    found = [source for count, source in zip(counts, sources, strict=True) if count]
+    if lost := [source for source in sources if source not in found]:
+        shares = "shares" if len(lost) == 1 else "share"
+        raise NoCamerasError(
+            f"{' and '.join(lost)} {shares} no view with {' and '.join(found) or 'each other'}: too little of what "
+            "stands still is seen by both; film the same surfaces from directions less than about 20° apart, or leave "
+            "out what shows another place"
+        )
     for count, total, source in zip(counts, of, sources, strict=True):
-        if count == 0:
-            raise NoCamerasError(
-                f"{source} shares no view with the other videos: too little of what stands still is seen by it and by "
-                "another one; film the same surfaces from directions less than about 20° apart, or leave it away"
-            )
         if count < MIN_REGISTERED * total:
             raise NoCamerasError(
                 f"cameras were found for only {count} of {total} frames of {source}: it moves too fast, or shares too "

@@ -1,6 +1,5 @@
 """The common clock of several videos of one event: when each was started, and the time that all of them show."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,9 +7,10 @@ from fractions import Fraction
 from pathlib import Path
 
 from warpgs.command_line.progress import progress
+from warpgs.errors import counted
 from warpgs.files import require_file
 
-from ..options import Selection
+from ..options import MIN_FRAMES, Selection
 from .sound import Match, compare, read_onsets
 from .video import MAX_BYTES, time_stamps
 
@@ -50,16 +50,19 @@ class Clock:
         return replace(selection, start=max(own + selection.start - EPSILON, 0.0), end=own + last + EPSILON)
 
 
-def common_clock(sources: Sequence[Path], offsets: Sequence[float] | None, quiet: bool = True) -> tuple[Clock, str]:
+def common_clock(
+    sources: Sequence[Path], offsets: Sequence[float] | None, quiet: bool = True, needed: int = MIN_FRAMES
+) -> tuple[Clock, str]:
     """The clock of several videos, and a note that says where it comes from.
 
     Args:
         sources: The videos.
         offsets: When each of them starts, from any common moment on [s]; None to find it from their sound.
         quiet: Whether to show no progress.
+        needed: Number of frames that each must have in the time that all of them show.
 
     Raises:
-        ValueError: If one is not a video, sound does not tell when it starts, or two have no time in common.
+        ValueError: If one is not a video, sound does not tell when it starts, or they have too little time in common.
     """
     for source in sources:
         require_file(source, MAX_BYTES)
@@ -67,15 +70,40 @@ def common_clock(sources: Sequence[Path], offsets: Sequence[float] | None, quiet
     found = find_offsets(sources, [s[0] for s in stamps], quiet) if offsets is None else list(offsets)
     starts = [start - min(found) for start in found]
     ends = [start + float(s[-1] - s[0]) for start, s in zip(starts, stamps, strict=True)]
-    for a, b in itertools.permutations(range(len(sources)), 2):
-        if ends[a] < starts[b]:
-            raise ValueError(
-                f"{sources[b]} starts {starts[b] - starts[a]:.2f} s after {sources[a]}, which takes only "
-                f"{ends[a] - starts[a]:.2f} s: they have no time in common"
-            )
+    clock = Clock(starts, max(starts), min(ends))
+    _require_together(sources, clock, [[float(t - own[0]) for t in own] for own in stamps], needed)
     where = "from their sound" if offsets is None else "as given"
     listed = ", ".join(f"{source.name} {start:.3f} s" for source, start in zip(sources, starts, strict=True))
-    return Clock(starts, max(starts), min(ends)), f"the videos start at {listed}, {where}"
+    return clock, f"the videos start at {listed}, {where}"
+
+
+def _require_together(sources: Sequence[Path], clock: Clock, times: Sequence[Sequence[float]], needed: int) -> None:
+    """Raises ValueError if a video has too few frames in the time that all show; names those that limit this time.
+
+    Args:
+        sources: The videos.
+        clock: Their clock.
+        times: Times of the frames of each, from its first on [s].
+        needed: Number of frames that each must have.
+    """
+    ends = [start + own[-1] for start, own in zip(clock.starts, times, strict=True)]
+    a, b = ends.index(clock.end), clock.starts.index(clock.begin)
+    if clock.end < clock.begin:
+        raise ValueError(
+            f"{sources[b]} starts {clock.begin - clock.starts[a]:.2f} s after {sources[a]}, which takes only "
+            f"{times[a][-1]:.2f} s: they have no time in common"
+        )
+    counts = [
+        sum(clock.begin - EPSILON <= start + time <= clock.end + EPSILON for time in own)
+        for start, own in zip(clock.starts, times, strict=True)
+    ]
+    if (count := min(counts)) < needed:
+        seconds, limits = clock.end - clock.begin, f"from the start of {sources[b]} to the end of {sources[a]}"
+        limits = f"the length of {sources[a]}" if seconds > times[a][-1] - EPSILON else limits
+        raise ValueError(
+            f"the videos show only {seconds:.2f} s together, {limits}: {counted(count, 'frame')} of "
+            f"{sources[counts.index(count)]}, at least {needed} are needed; leave out what is too short or damaged"
+        )
 
 
 def find_offsets(sources: Sequence[Path], first_frames: Sequence[Fraction], quiet: bool = True) -> list[float]:
@@ -97,10 +125,13 @@ def find_offsets(sources: Sequence[Path], first_frames: Sequence[Fraction], quie
         onsets.append(found)
     matches = compare(onsets)
     starts = _placed(matches, len(sources))
+    if len(starts) == 1:
+        raise ValueError(f"the sounds of {' and '.join(map(str, sources))} do not tell when they start: {GIVE}")
     if lost := [source for k, source in enumerate(sources) if k not in starts]:
         found_so_far = ", ".join(f"{sources[k].name} {start:.2f} s" for k, start in sorted(starts.items()))
-        others = f" (found: {found_so_far})" if len(starts) > 1 else ""
-        raise ValueError(f"the sound of {lost[0]} does not tell when it starts{others}: {GIVE}")
+        raise ValueError(
+            f"the sound of {lost[0]} does not tell when it starts (found: {found_so_far}): {GIVE}, or leave it out"
+        )
     for (a, b), match in matches.items():
         if match.is_certain and abs(starts[b] - starts[a] - match.offset) > MAX_CONTRADICTION:
             raise ValueError(
@@ -111,11 +142,16 @@ def find_offsets(sources: Sequence[Path], first_frames: Sequence[Fraction], quie
 
 
 def _placed(matches: dict[tuple[int, int], Match], count: int) -> dict[int, float]:
-    """When each recording starts after the first one, for those that certain matches connect with it.
+    """When each recording starts after the first one, for the most recordings that certain matches connect."""
+    return max((_placed_with(first, matches, count) for first in range(count)), key=len)
+
+
+def _placed_with(first: int, matches: dict[tuple[int, int], Match], count: int) -> dict[int, float]:
+    """When each recording that certain matches connect with one starts after that one.
 
     Prim's algorithm: the most certain match from a placed recording to another one places the latter.
     """
-    starts = {0: 0.0}
+    starts = {first: 0.0}
     while len(starts) < count:
         reaching = {
             pair: match for pair, match in matches.items() if match.is_certain and len(starts.keys() & {*pair}) == 1
