@@ -108,11 +108,27 @@ def test_a_built_in_capture_without_its_prefix_is_told_the_names(name):
 
 
 def test_a_capture_that_prepare_has_not_finished_is_refused(root):
-    write_json(root / WORK / STATE, {"done": {"capture": {}}})
+    write_json(root / WORK / STATE, {"options": {"source": "/my clip.mp4"}, "done": {"capture": {}}})
+    message = (
+        r"is not finished: .* \(warpgs prepare '/my clip\.mp4' .*, with its options\); or remove .*\.prepare to use"
+    )
     for dataset in (None, "nerfds"):
-        refused(root, r"is not finished: run the same warpgs prepare again, or remove .*\.prepare", dataset=dataset)
+        refused(root, message, dataset=dataset)
     write_json(root / WORK / STATE, {"done": {"capture": {}, FINISHED: {}}})
     assert load_capture(root).train
+
+
+@pytest.mark.parametrize(
+    ("state", "sources"), [({"options": {"source": ["a.mp4", "b.mp4"]}, "done": {}}, "a.mp4 b.mp4"), (None, "VIDEO")]
+)
+def test_a_preparation_that_was_interrupted_before_it_wrote_a_capture_is_told_how_it_goes_on(tmp_path, state, sources):
+    (tmp_path / WORK / "new").mkdir(parents=True)
+    if state is not None:
+        write_json(tmp_path / WORK / STATE, state)
+    refused(
+        tmp_path,
+        rf"is not finished: warpgs prepare was interrupted.* \(warpgs prepare {sources} .*, with its options\)$",
+    )
 
 
 def test_a_run_folder_is_not_taken_for_a_capture(tmp_path):

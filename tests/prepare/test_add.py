@@ -143,7 +143,7 @@ def test_depth_is_not_added_beside_incomplete_masks(root):
 def test_nothing_is_added_to_a_capture_that_is_not_finished(root):
     (root / WORK).mkdir()
     (root / WORK / STATE).write_text('{"done": {}}')
-    with pytest.raises(ValueError, match="is not finished: run the same warpgs prepare again"):
+    with pytest.raises(ValueError, match="is not finished: warpgs prepare was interrupted"):
         add_parts(root, AddOptions(["masks"], masks="red"))
     assert not (root / "resized_mask").exists()
 

@@ -125,8 +125,8 @@ def find_problems(scenes: Mapping[str, str]) -> dict[str, str]:
     for name, path in scenes.items():
         if not is_builtin(path):
             try:
-                require_capture(Path(path))
                 require_finished(Path(path))
+                require_capture(Path(path))
             except (ValueError, OSError) as error:
                 problems[name] = one_line(error)
     return problems

@@ -88,10 +88,10 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
     check_perturbation(options.perturbation)
     if dataset is not None and not root.exists():
         raise ValueError(missing_capture(root))
+    require_finished(root)
     layout = dataset or _recognized(root)
     if layout is None:
         require_capture(root)
-    require_finished(root)
     layout = layout or FALLBACK
     capture = LOADERS[layout].load(root, options)
     _require_sides(root, capture)
@@ -160,15 +160,20 @@ def require_capture(root: Path) -> None:
 
 
 def require_finished(root: Path) -> None:
-    """Raises ValueError if ``warpgs prepare`` has not finished a capture."""
+    """Raises ValueError if ``warpgs prepare`` was interrupted in a folder; says how it goes on."""
+    work, sources = root / WORK, ["VIDEO"]
     try:
-        is_finished = FINISHED in read_json(root / WORK / STATE)["done"]
+        state = read_json(work / STATE)
+        if FINISHED in state["done"]:
+            return
+        given = dict(state.get("options", {})).get("source", sources)
+        sources = given if isinstance(given, list) else [given]
     except (ValueError, KeyError, TypeError):  # no such file, or none of its own
-        return
-    if not is_finished:
-        raise ValueError(
-            f"{root} is not finished: run the same warpgs prepare again, or remove {root / WORK} to use what is there"
-        )
+        if not work.is_dir() or is_capture(root):
+            return
+    goes_on = f"the same command continues it ({command('prepare', *sources, root)}, with its options)"
+    instead = f"; or remove {work} to use what is there" if is_capture(root) else ""
+    raise ValueError(f"{root} is not finished: warpgs prepare was interrupted, or still runs; {goes_on}{instead}")
 
 
 def recognize(root: Path) -> str:
