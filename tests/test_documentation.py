@@ -15,7 +15,7 @@ import pytest
 from tests import tiny
 from warpgs.cli import COMMANDS
 from warpgs.command_line.parsing import flags, parse
-from warpgs.config import presets
+from warpgs.config import builtin, presets
 from warpgs.runs.run import Run
 from warpgs.training import command as training
 
@@ -230,3 +230,10 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert not re.search(r"@@\w+@@", pages)  # a placeholder that nobody has filled in
     assert not re.search(r"<h\d[^>]*>[^<]*\\", pages)  # an escape that only GitHub understands
     assert not re.search(r'(?:src|href)="https?://[^"]*\.(?:js|css|woff2?)"', pages)  # loads nothing from elsewhere
+
+
+@pytest.mark.parametrize("capture", builtin.QUERIES)
+def test_every_option_of_a_built_in_capture_is_explained(capture):
+    _, _, rows = (ROOT / "docs" / "cluster.md").read_text().partition(f"| `builtin:{capture}` |")
+    options = re.findall(r"\| `\?(\w+)=", rows.partition("| `builtin:")[0])
+    assert sorted(options) == sorted(builtin.QUERIES[capture])

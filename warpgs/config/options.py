@@ -29,7 +29,8 @@ class TrainConfig:
     """Trains SplitGaussian on a capture, or on the built-in scene if no capture is given."""
 
     data: Path | None = None
-    """Folder of the capture, or builtin:studio (docs/cluster.md), builtin:rig or builtin:balls; else builtin:room."""
+    """Folder of the capture, or a built-in one (docs/cluster.md): builtin:studio, builtin:rig or builtin:balls; else
+    builtin:room."""
     dataset: str | None = None
     """Layout of the capture: nerfds, hypernerf, iphone, nerfstudio, blender (D-NeRF), dynerf, llff (NVIDIA), colmap,
     vipe or megasam; recognized from its files if omitted."""
