@@ -4,15 +4,16 @@ A camera is described by its centre and its directions right, up and forward in 
 its format defines, and ``pixel_of`` projects without any matrix.
 """
 
+import io
 import json
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import av
 import numpy as np
+import OpenEXR
 from scipy.spatial.transform import Rotation
 
 from tests.data.captures import image_of, write_array, write_json, write_png
@@ -197,30 +198,12 @@ def write_megasam(root: Path) -> Path:
     return root
 
 
-def exr(values: np.ndarray, compression: int = 3) -> bytes:
-    """An OpenEXR file with the half channel Z, its blocks deflated (3: 16 lines, 2: one line) or not (0)."""
-
-    def attribute(name: str, kind: str, value: bytes) -> bytes:
-        return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(value)) + value
-
-    height, width = values.shape
-    lines = {0: 1, 2: 1, 3: 16}[compression]
-    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
-    header = b"v/1\x01" + struct.pack("<I", 2)
-    header += attribute("channels", "chlist", b"Z\0" + struct.pack("<iIii", 1, 0, 1, 1) + b"\0")
-    header += attribute("compression", "compression", bytes([compression]))
-    header += attribute("dataWindow", "box2i", window) + attribute("displayWindow", "box2i", window) + b"\0"
-    blocks = []
-    for row in range(0, height, lines):
-        raw = values[row : row + lines].astype("<f2").tobytes()
-        ordered = np.frombuffer(raw[0::2] + raw[1::2], np.uint8).astype(int)
-        differences = np.concatenate([ordered[:1], np.diff(ordered) + 128]) & 255
-        packed = zlib.compress(differences.astype(np.uint8).tobytes())
-        stored = packed if compression and len(packed) < len(raw) else raw
-        blocks.append(struct.pack("<ii", row, len(stored)) + stored)
-    start = len(header) + 8 * len(blocks)
-    offsets = [start + sum(map(len, blocks[:k])) for k in range(len(blocks))]
-    return header + struct.pack(f"<{len(blocks)}Q", *offsets) + b"".join(blocks)
+def exr(values: np.ndarray, channel: str = "Z", compression: str = "ZIP") -> bytes:
+    """An OpenEXR image with a channel of half floats."""
+    stream = io.BytesIO()
+    header = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION"), "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {channel: values.astype(np.float16)}).write(stream)
+    return stream.getvalue()
 
 
 def write_vipe(root: Path) -> Path:

@@ -5,8 +5,6 @@ fx, fy, cx, cy [px], rgb/<video>.mp4 the frames, depth/<video>.zip depth in the 
 mask/<video>.zip instances of objects that can move (<frame>.png, 0 = none), mask/<video>.txt their names.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -198,18 +196,5 @@ def _static_mask(member: _Member, still: list[int], size: Size) -> Bool[np.ndarr
 
 def _inverse_depth(member: _Member, size: Size) -> Float[np.ndarray, "H W"]:
     data = member.read()
-    with _naming(member.path):
-        stored = exr_size(data)
-    check_shape(member.path, "the depth", stored, size)
-    with _naming(member.path):
-        depth = read_exr_channel(data, "Z", max_depth_pixels(size))
-    return inverse_of(depth, size)
-
-
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Puts a path before the message of a ValueError."""
-    try:
-        yield
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    check_shape(member.path, "the depth", exr_size(member.path, data), size)
+    return inverse_of(read_exr_channel(member.path, data, "Z", max_depth_pixels(size)), size)

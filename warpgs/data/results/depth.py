@@ -63,10 +63,7 @@ def _file_of(folder: Path, name: str) -> Path:
 def _read_file(path: Path) -> Shaped[np.ndarray, "..."]:
     if path.suffix.lower() == ".npy":
         return read_array(path, MAX_PIXELS)
-    try:
-        return read_exr_channel(read_bounded(path, MAX_FILE), "Y")  # OpenCV's name of a single channel
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return read_exr_channel(path, read_bounded(path, MAX_FILE), "Y")  # OpenCV's name of a single channel
 
 
 def _inverse(path: Path, depth: Shaped[np.ndarray, "..."], size: tuple[int, int]) -> Float[np.ndarray, "h w"]:
