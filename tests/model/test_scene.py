@@ -10,7 +10,7 @@ from tests import plain
 from tests.reference.covariance import covariance, rotation
 from tests.scenes import as_gaussians, error, generator, make_camera, make_splats, relative_error
 from warpgs.config import RenderSettings
-from warpgs.model.scene import SplitScene
+from warpgs.model.scene import InTraining, SplitScene
 from warpgs.model.splats import Splats
 from warpgs.rendering import render
 
@@ -127,7 +127,7 @@ def test_opacities_are_constant_where_the_network_changes_colours_alone():
 
 def test_the_appearance_network_gets_no_gradient_from_hidden_gaussians():
     scene, is_hidden = make_scene(appearance="all"), torch.arange(NUM_STATIC) < 3
-    splats = scene.splats(TIME, is_hidden=is_hidden)
+    splats = scene.splats(TIME, training=InTraining(is_hidden))
     assert not differing(static_part(splats), static_part(scene.splats(TIME)))
     weights = scene.appearance.trunk.values
     for changes in (splats.sh, splats.opacities):

@@ -67,6 +67,19 @@ class PointsInTime(NamedTuple):
     times: Float[Tensor, " T"]
 
 
+class InTraining(NamedTuple):
+    """What a training step alone asks of a scene.
+
+    Attributes:
+        is_hidden: [num_static] static Gaussians from which the appearance network gets no gradient; none if None.
+        points: Other points that the deformation moves in the same evaluation. Its kernels are so many and so small
+            that a second one takes longer than more rows in the first; None without.
+    """
+
+    is_hidden: Bool[Tensor, " num_static"] | None = None
+    points: PointsInTime | None = None
+
+
 class SplitScene(nn.Module):
     """G_s ∪ G_d with their networks (paper Eq. 5).
 
@@ -138,7 +151,7 @@ class SplitScene(nn.Module):
         use_appearance: bool = True,
         sh_degree: int | None = None,
         time_noise: Float[Tensor, " T"] | None = None,
-        is_hidden: Bool[Tensor, " num_static"] | None = None,
+        training: InTraining | None = None,
     ) -> Splats:
         """The activated Gaussians at a time, static ones first.
 
@@ -149,33 +162,11 @@ class SplitScene(nn.Module):
             sh_degree: Maximum degree of spherical harmonics to use; all if None. Reflections need all.
             time_noise: Added to the time that the deformation network sees, one number or [D] of each dynamic Gaussian
                 (annealed smoothing of Deformable-3DGS, ``with_delays``).
-            is_hidden: Static Gaussians from which the appearance network gets no gradient; none if None.
-        """
-        return self.splats_and_offsets(None, time, use_deformation, use_appearance, sh_degree, time_noise, is_hidden)[0]
-
-    def splats_and_offsets(
-        self,
-        points: PointsInTime | None,
-        time: Float[Tensor, "1"],
-        use_deformation: bool = True,
-        use_appearance: bool = True,
-        sh_degree: int | None = None,
-        time_noise: Float[Tensor, " T"] | None = None,
-        is_hidden: Bool[Tensor, " num_static"] | None = None,
-    ) -> tuple[Splats, Float[Tensor, "M 10"] | None]:
-        """``splats``, and what the deformation returns for M other points, in one evaluation of it.
-
-        Its kernels are so many and so small that a second evaluation takes longer than more rows in the first one.
-
-        Args:
-            points: The other points; None without.
-            time, use_deformation, use_appearance, sh_degree, time_noise, is_hidden: As of ``splats``.
-
-        Returns:
-            The Gaussians, and [M, 10] offsets of the points; None without points, dynamic Gaussians or deformation.
+            training: What a training step asks for in addition.
         """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
-        residuals = logit_residuals = offsets = other_offsets = None
+        residuals = logit_residuals = offsets = others = None
+        is_hidden, points = training or InTraining()
         with concurrently(device) as beside:
             with beside:
                 if use_appearance and len(static):
@@ -183,13 +174,13 @@ class SplitScene(nn.Module):
                 sh = join_sh(static.raw(), dynamic.raw(), residuals)
             if use_deformation and len(dynamic):
                 own = PointsInTime(dynamic.means, time if time_noise is None else time + time_noise)
-                offsets, other_offsets = self._offsets(own, points, time)
+                offsets, others = self._offsets(own, points, time)
         static_changes, dynamic_changes = Changes(logit_residuals=logit_residuals), Changes(offsets)
         geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
         geometry = geometry._replace(opacities=self.faded(geometry.opacities, time))
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
-        splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree)
-        return self._reflecting(splats), other_offsets
+        splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree, others=others)
+        return self._reflecting(splats)
 
     def _reflecting(self, splats: Splats) -> Splats:
         """The splats with what the dynamic ones reflect, once all degrees of spherical harmonics are in use."""
@@ -203,16 +194,16 @@ class SplitScene(nn.Module):
     def _offsets(
         self, own: PointsInTime, others: PointsInTime | None, time: Float[Tensor, "1"]
     ) -> tuple[Tensor, Tensor | None]:
-        """Offsets of the deformation at the dynamic Gaussians, and at other points around a time if there are any."""
+        """Offsets of the dynamic Gaussians, and positions of other points, if any, around a time, both deformed."""
         if self.num_segments > 1:
-            others_offsets = None if others is None else self.around(time)[1](*others)
-            return self.deformation(*own, time, self.rows()), others_offsets
+            offsets = self.deformation(*own, time, self.rows())
+            return offsets, None if others is None else others.means + self.around(time)[1](*others)[:, :3]
         if others is None:
             return self.deformation(*own), None
         sizes = [len(own.means), len(others.means)]
         times = torch.cat([own.times.expand(sizes[0]), others.times])
-        offsets, other_offsets = self.deformation(torch.cat([own.means, others.means]), times).split(sizes)
-        return offsets, other_offsets
+        offsets, of_others = self.deformation(torch.cat([own.means, others.means]), times).split(sizes)
+        return offsets, others.means + of_others[:, :3]
 
     def offsets(self, time: Float[Tensor, "1"], noise: Float[Tensor, " T"] | None = None) -> Float[Tensor, "D 10"]:
         """Offsets of the dynamic Gaussians at a time; one number or [D] of noise is added to it for the network."""

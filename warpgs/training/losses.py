@@ -28,8 +28,6 @@ class LossInputs(NamedTuple):
         backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
         alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.
         depth_trust: How much the view's depth is trusted. None like ``alignment``.
-        paths: [3, K, 3] positions of some dynamic Gaussians one frame before a moment near that of the view, then, and
-            one frame after; None unless ``LossConfig.acceleration``, the deformation and dynamic Gaussians are in use.
         unit: Length that counts as 1 (``TrainConfig.length_unit``) [scene units].
     """
 
@@ -40,7 +38,6 @@ class LossInputs(NamedTuple):
     backgrounds: Float[Tensor, "3 3"]
     alignment: Float[Tensor, "2"] | None
     depth_trust: DepthTrust | None
-    paths: Float[Tensor, "3 K 3"] | None = None
     unit: float = 1.0
 
 

@@ -15,7 +15,7 @@ from warpgs.data.capture import background_color
 from warpgs.evaluation.image_quality import MIN_SQUARED_ERROR
 from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.dome import Dome
-from warpgs.model.scene import PointsInTime, SplitScene
+from warpgs.model.scene import InTraining, PointsInTime, SplitScene
 from warpgs.model.splats import Splats
 from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
@@ -24,7 +24,7 @@ from warpgs.runtime.graphs import GraphCache
 from warpgs.views.views import View, Views
 
 from . import optimizer as optim
-from .acceleration import paths_of, sampled_points
+from .acceleration import sampled_points
 from .density import make_strategy
 from .loss_terms import TERMS
 from .losses import LossInputs, only_shown
@@ -179,8 +179,7 @@ class Step:
         if phase.use_deformation:
             noise = self.scene.with_delays(view.camera, view.time, noise)
         points = self._points(view) if phase.use_deformation and self.config.loss.acceleration > 0 else None
-        splats, offsets = self.scene.splats_and_offsets(points, view.time, *flags, phase.sh_degree, noise, is_hidden)
-        paths = None if points is None or offsets is None else paths_of(points, offsets)
+        splats = self.scene.splats(view.time, *flags, phase.sh_degree, noise, InTraining(is_hidden, points))
         splats = self._with_chosen_segments(splats, view.time)
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
@@ -194,7 +193,7 @@ class Step:
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
         length = self.config.length_unit(self.unit)
-        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust, paths, length)
+        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust, length)
         terms = {name: TERMS[name].compute(inputs) for name in self._active(phase)}
         weights = torch.stack([self._inputs.scale[name] for name in terms])
         (torch.stack(list(terms.values())) * weights).sum().backward()
