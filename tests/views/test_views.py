@@ -17,6 +17,7 @@ from warpgs.data.dynamic_regions import dynamic_counts
 from warpgs.distortion import Distortion
 from warpgs.model.poses import PoseCorrections
 from warpgs.views import views as module
+from warpgs.views.part import Part
 from warpgs.views.pixels import mask_border
 from warpgs.views.stacked_cameras import StackedCameras
 from warpgs.views.views import Views
@@ -410,3 +411,16 @@ def test_the_sample_of_many_views_is_spread_over_cameras_and_times(monkeypatch):
     assert sample == sorted({*sample})
     assert [*Counter(index % 6 for index in sample).values()] == [10] * 6
     assert len({index // 6 for index in sample}) > 25
+
+
+def test_a_part_reads_its_views_from_the_whole(capture, monkeypatch):
+    monkeypatch.setattr(module, "MANY", 2)
+    monkeypatch.setattr(module, "SAMPLED", 2)
+    views = views_of(capture)
+    part = Part(views, range(1, len(views)))
+    assert (len(part), part.device) == (len(views) - 1, views.device)
+    assert len(part.sample) == 2
+    assert max(part.sample) < len(part)
+    for k, view, frame in zip((2, 0), part.each((2, 0)), part.frames((2, 0)), strict=True):
+        assert torch.equal(view.image, views[k + 1].image)
+        assert frame.name == capture.train[k + 1]

@@ -1,44 +1,21 @@
 """The dynamic Gaussians that stage I starts from, of each segment of time."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from warpgs.config import TrainConfig
-from warpgs.data.capture import Capture, Frame
+from warpgs.data.capture import Capture
 from warpgs.model.gaussians import Gaussians
 from warpgs.model.segmented_deformation import SegmentedDeformation
 from warpgs.model.segments import window
-from warpgs.views.views import View, Views
+from warpgs.views.part import Part
+from warpgs.views.views import Views
 
 from .initialize import DynamicStart, dynamic_gaussians
-
-
-class _Part(Views):
-    """Some of the views, in their order."""
-
-    def __init__(self, views: Views, indices: Sequence[int]) -> None:
-        self._whole, self._indices, self.device = views, indices, views.device
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def __getitem__(self, index: int) -> View:
-        return self._whole[self._indices[index]]
-
-    @property
-    def videos(self) -> list[list[int]]:
-        position = {index: k for k, index in enumerate(self._indices)}
-        return [[position[index] for index in video if index in position] for video in self._whole.videos]
-
-    def each(self, indices: Sequence[int]) -> Iterator[View]:
-        return self._whole.each([self._indices[k] for k in indices])
-
-    def frames(self, indices: Sequence[int]) -> Iterator[Frame]:
-        return self._whole.frames([self._indices[k] for k in indices])
 
 
 def dynamic_start(
@@ -60,7 +37,7 @@ def dynamic_start(
         if not indices:
             found.append(DynamicStart(Gaussians.empty(0, config.model.sh_degree)))
             continue
-        start = dynamic_gaussians(config, part, _Part(views, indices), alignments[indices], network, *sources)
+        start = dynamic_gaussians(config, part, Part(views, indices), alignments[indices], network, *sources)
         if start is None:
             return None
         found.append(start)

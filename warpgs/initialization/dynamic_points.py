@@ -14,6 +14,7 @@ from warpgs.data.capture import Capture
 from warpgs.data.dynamic_regions import MIN_KNOWN_FRACTION
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.model.gaussians import Gaussians
+from warpgs.views.part import SomeViews
 from warpgs.views.views import View, Views
 
 from .point_cloud import gaussians_at, random_points, subsample, unproject
@@ -131,7 +132,7 @@ def gaussians_in_box(capture: Capture, count: int, config: TrainConfig, generato
 @torch.no_grad()
 def unproject_pixels(
     capture: Capture,
-    views: Views,
+    views: SomeViews,
     alignments: Float[Tensor, "T 2"],
     mask_of: Callable[[View], Bool[Tensor, "H W"]],
     max_count: int,
@@ -172,7 +173,7 @@ def unproject_pixels(
 
 
 def _unproject(
-    views: Views,
+    views: SomeViews,
     chosen: Sequence[int],
     mask_of: Callable[[View], Tensor],
     depth_of: Callable[[int, View, Tensor], Tensor],

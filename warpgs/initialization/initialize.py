@@ -15,6 +15,7 @@ from warpgs.model.gaussians import Gaussians
 from warpgs.model.mlp_deformation import MlpDeformation
 from warpgs.model.scene import SplitScene
 from warpgs.model.spline_deformation import SplineDeformation
+from warpgs.views.part import SomeViews
 from warpgs.views.views import Views
 
 from .dynamic_points import MAX_SCALE, DynamicPoints, gaussians_in_box, is_depth_known, unproject_pixels
@@ -58,7 +59,9 @@ def initial_scene(
     return scene
 
 
-def _gaussians_at_points(config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator) -> Gaussians:
+def _gaussians_at_points(
+    config: TrainConfig, capture: Capture, views: SomeViews, generator: torch.Generator
+) -> Gaussians:
     """Gaussians at a random subset of the capture's points; closer ones than its cameras resolve are at one place."""
     points, colors = _colored_points(config, capture, views, generator)
     focal = torch.stack([capture.cameras[name].focal for name in capture.train]).median()
@@ -67,7 +70,7 @@ def _gaussians_at_points(config: TrainConfig, capture: Capture, views: Views, ge
 
 
 def _colored_points(
-    config: TrainConfig, capture: Capture, views: Views, generator: torch.Generator
+    config: TrainConfig, capture: Capture, views: SomeViews, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """A random subset of the capture's points, with their colours or those of the frames, in [0, 1]."""
     points, colors, max_count = capture.points, capture.point_colors, config.model.max_static_points
@@ -110,7 +113,7 @@ class DynamicStart(NamedTuple):
 def dynamic_gaussians(
     config: TrainConfig,
     capture: Capture,
-    views: Views,
+    views: SomeViews,
     alignments: Float[Tensor, "T 2"],
     deformation: nn.Module,
     generator: torch.Generator,
@@ -144,7 +147,7 @@ def dynamic_gaussians(
     return DynamicStart(gaussians, fit.points is observed.points, fit.num_tracks)
 
 
-def _observed(capture: Capture, views: Views, alignments: Float[Tensor, "T 2"], found: DynamicPoints) -> Observed:
+def _observed(capture: Capture, views: SomeViews, alignments: Float[Tensor, "T 2"], found: DynamicPoints) -> Observed:
     """What a deformation is fitted to: points, and tracks if the capture has some on what moves.
 
     Without tracks, which are of one view each, the points of all views at one time are compared together: cameras

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from warpgs.data.capture import Frame
 from warpgs.data.masks import connected_regions
 from warpgs.data.sampling import evenly_spaced_indices
-from warpgs.views.views import Views
+from warpgs.views.part import SomeViews
 
 MIN_PIXELS = 12
 """Minimum size of a region."""
@@ -52,7 +52,7 @@ class Region(NamedTuple):
         )
 
 
-def find_regions(views: Views) -> list[list[Region]]:
+def find_regions(views: SomeViews) -> list[list[Region]]:
     """The regions of each training view."""
     return [_regions(frame) for frame in views.frames(range(len(views)))]
 

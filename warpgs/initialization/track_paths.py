@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from warpgs.data import depth_alignment
 from warpgs.data.sampling import evenly_spaced_indices
 from warpgs.data.tracks import Tracks
-from warpgs.views.views import Views
+from warpgs.views.part import SomeViews
 
 MIN_SEEN, MIN_DYNAMIC = 4, 0.5
 """Minimum number of training frames in which a track is on what moves, and minimum part of those that see it."""
@@ -41,7 +41,7 @@ class Paths(NamedTuple):
 
 
 @torch.no_grad()
-def dynamic_paths(tracks: Tracks, names: list[str], views: Views, alignments: Float[Tensor, "T 2"]) -> Paths:
+def dynamic_paths(tracks: Tracks, names: list[str], views: SomeViews, alignments: Float[Tensor, "T 2"]) -> Paths:
     """Tracks that stay on what masks mark as dynamic, at most ``MAX_PATHS``.
 
     Args:
@@ -53,7 +53,7 @@ def dynamic_paths(tracks: Tracks, names: list[str], views: Views, alignments: Fl
     positions = tracks.positions[:, [tracks.frames.index(name) for name in names]]
     origins, num = torch.zeros(len(names), 3, dtype=torch.float32), len(positions)
     rays, points, colors = torch.full((3, num, len(names), 3), torch.nan, dtype=torch.float32)
-    for k, view in enumerate(views):
+    for k, view in enumerate(views.each(range(len(views)))):
         camera, (height, width) = view.camera, view.static_mask.shape
         placed = torch.from_numpy(positions[:, k] * np.array([width, height], np.float32)).to(views.device)
         column, row = placed.nan_to_num(0.0).long().unbind(1)

@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 
 from warpgs.data.capture import Capture
-from warpgs.views.views import Views
+from warpgs.views.part import SomeViews
 
 from .silhouettes import MIN_PIXELS, Region, find_regions
 
@@ -73,7 +73,7 @@ class Track:
     regions: list[Region]
 
 
-def find_tracks(capture: Capture, views: Views) -> list[Track]:
+def find_tracks(capture: Capture, views: SomeViews) -> list[Track]:
     """Tracks of the objects that a capture shows before transparent surroundings, one per colour.
 
     Returns:

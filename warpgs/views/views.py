@@ -63,6 +63,12 @@ class View(NamedTuple):
     mask_trust: Float[Tensor, ""]
 
 
+def sample_of(videos: list[list[int]]) -> list[int]:
+    """``Views.sample`` of views whose ``Views.videos`` these are."""
+    indices = [index for video in videos for index in video]
+    return sorted(evenly_spaced(indices, SAMPLED) if len(indices) > MANY else indices)
+
+
 class Views:
     """The training frames of a capture.
 
@@ -191,9 +197,7 @@ class Views:
     @cached_property
     def sample(self) -> Sequence[int]:
         """The indices of all views, or of ``SAMPLED`` of more than ``MANY``: spread over cameras and times."""
-        if len(self) <= MANY:
-            return range(len(self))
-        return sorted(evenly_spaced([index for video in self.videos for index in video], SAMPLED))
+        return sample_of(self.videos)
 
     @property
     def videos(self) -> list[list[int]]:
