@@ -10,6 +10,7 @@ from tests import plain, tiny
 from warpgs.editing.contribution import blend_weights_in
 from warpgs.initialization.plan import make_plan
 from warpgs.initialization.prepare_start import prepare_again
+from warpgs.model import segments as segments_module
 from warpgs.model.segments import nearest, window
 from warpgs.rendering import DEFAULTS, render
 from warpgs.runs import checkpoint
@@ -217,3 +218,14 @@ def test_views_of_an_overlap_show_each_segment_alone_in_a_third_of_the_iteration
         plan = trainer.protocol.at(trainer.iteration)
         trainer.step(plan, trainer._sample(plan)._replace(dropout_seed=seed))
     assert seen == {(True, False), (True, True), (False, True)}
+
+
+def test_a_step_fades_opacities_once(data, tmp_path, monkeypatch):
+    trainer, calls = tiny.trainer(data, tmp_path, CONFIG), []
+    trainer.iteration = trainer.protocol.stage1.start
+    trainer._add_dynamic_gaussians()
+    faded = segments_module.faded
+    monkeypatch.setattr(segments_module, "faded", lambda *args: (calls.append(len(args[0])), faded(*args))[1])
+    plan = trainer.protocol.at(trainer.iteration)
+    trainer.step(plan, trainer._sample(plan))
+    assert calls == [len(trainer.scene.dynamic)]

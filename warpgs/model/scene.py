@@ -74,10 +74,12 @@ class InTraining(NamedTuple):
         is_hidden: [num_static] static Gaussians from which the appearance network gets no gradient; none if None.
         points: Other points that the deformation moves in the same evaluation. Its kernels are so many and so small
             that a second one takes longer than more rows in the first; None without.
+        choice: What is seen in overlaps of segments, as of ``segments.weights``.
     """
 
     is_hidden: Bool[Tensor, " num_static"] | None = None
     points: PointsInTime | None = None
+    choice: Float[Tensor, "1"] | None = None
 
 
 class SplitScene(nn.Module):
@@ -166,7 +168,7 @@ class SplitScene(nn.Module):
         """
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
         residuals = logit_residuals = offsets = others = None
-        is_hidden, points = training or InTraining()
+        is_hidden, points, choice = training or InTraining()
         with concurrently(device) as beside:
             with beside:
                 if use_appearance and len(static):
@@ -177,7 +179,7 @@ class SplitScene(nn.Module):
                 offsets, others = self._offsets(own, points, time)
         static_changes, dynamic_changes = Changes(logit_residuals=logit_residuals), Changes(offsets)
         geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
-        geometry = geometry._replace(opacities=self.faded(geometry.opacities, time))
+        geometry = geometry._replace(opacities=self._faded(geometry.opacities, time, choice))
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
         splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree, others=others)
         return self._reflecting(splats)
@@ -209,13 +211,10 @@ class SplitScene(nn.Module):
         """Offsets of the dynamic Gaussians at a time; one number or [D] of noise is added to it for the network."""
         return self._offsets(PointsInTime(self.dynamic.means, time if noise is None else time + noise), None, time)[0]
 
-    def faded(
-        self, opacities: Float[Tensor, " N"], time: Float[Tensor, "1"], choice: Float[Tensor, "1"] | None = None
+    def _faded(
+        self, opacities: Float[Tensor, " N"], time: Float[Tensor, "1"], choice: Float[Tensor, "1"] | None
     ) -> Float[Tensor, " N"]:
-        """Opacities, of which those of the dynamic Gaussians are 0 outside of their segments, if they have any.
-
-        ``choice`` says what is seen in overlaps, as of ``segments.weights``.
-        """
+        """Opacities, of which those of the dynamic Gaussians are 0 outside of their segments, if they have any."""
         dynamic = self.dynamic
         if dynamic.segments is None:
             return opacities

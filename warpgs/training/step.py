@@ -15,8 +15,7 @@ from warpgs.data.capture import background_color
 from warpgs.evaluation.image_quality import MIN_SQUARED_ERROR
 from warpgs.initialization.alignment import DepthTrust
 from warpgs.model.dome import Dome
-from warpgs.model.scene import InTraining, PointsInTime, SplitScene
-from warpgs.model.splats import Splats
+from warpgs.model.scene import InTraining, SplitScene
 from warpgs.ops.dropout import dropout
 from warpgs.rendering import Rendering, render
 from warpgs.runtime import ranks
@@ -174,13 +173,10 @@ class Step:
         self._choose_trained(phase)
         view = self.views.selected()
         flags = (phase.use_deformation, phase.use_appearance)
-        is_hidden = self._is_hidden(view) if phase.use_appearance and not self.config.loss.hidden_appearance else None
         noise = self._inputs.time_noise
         if phase.use_deformation:
             noise = self.scene.with_delays(view.camera, view.time, noise)
-        points = self._points(view) if phase.use_deformation and self.config.loss.acceleration > 0 else None
-        splats = self.scene.splats(view.time, *flags, phase.sh_degree, noise, InTraining(is_hidden, points))
-        splats = self._with_chosen_segments(splats, view.time)
+        splats = self.scene.splats(view.time, *flags, phase.sh_degree, noise, self._in_training(view, phase))
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
@@ -204,15 +200,18 @@ class Step:
         self._add_to_sums(terms, rendering, view)
         return ()
 
-    def _with_chosen_segments(self, splats: Splats, time: Float[Tensor, "1"]) -> Splats:
-        """In an overlap of segments, each of them alone or both, in a third of the iterations each.
+    def _in_training(self, view: View, phase: Phase) -> InTraining:
+        """What this step asks of the scene.
 
-        So each segment learns to show all of the overlap by itself, and does not change where the other one fades.
+        In an overlap of segments it sees each of them alone or both, in a third of the iterations each. So each segment
+        learns to show all of the overlap by itself, and does not change where the other one fades.
         """
-        if self.scene.num_segments == 1:
-            return splats
-        choice = self._inputs.dropout_seed % 3 - 1.0
-        return replace(splats, opacities=self.scene.faded(splats.opacities, time, choice))
+        seed, config = self._inputs.dropout_seed, self.config.loss
+        is_hidden = self._is_hidden(view) if phase.use_appearance and not config.hidden_appearance else None
+        points = None
+        if phase.use_deformation and config.acceleration > 0:
+            points = sampled_points(self.scene, view.time, self.views.interval, seed)
+        return InTraining(is_hidden, points, seed % 3 - 1.0 if self.scene.num_segments > 1 else None)
 
     def _backgrounds(self) -> Float[Tensor, "3 3"]:
         """Colours behind the joint, the static and the dynamic image; the first two are black under a sky.
@@ -241,9 +240,6 @@ class Step:
         """Static Gaussians whose centres the mask says to be behind something dynamic."""
         row, column, _, is_inside = view.camera.project(self.scene.static.means)
         return is_inside & ~view.static_mask[row, column]
-
-    def _points(self, view: View) -> PointsInTime:
-        return sampled_points(self.scene, view.time, self.views.interval, self._inputs.dropout_seed)
 
     def _depth_of_view(self) -> tuple[Tensor, DepthTrust]:
         """Alignment of the depth of the selected view, and how much it is trusted."""
