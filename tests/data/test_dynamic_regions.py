@@ -20,7 +20,7 @@ def frame_of(width: int, height: int, *boxes: tuple[slice, slice]) -> Frame:
 
 def test_regions_are_found_in_masks_of_a_maximum_side():
     frame = frame_of(2 * MAX_SIDE, 200, (slice(40, 80), slice(100, 200)), (slice(120, 122), slice(300, 302)))
-    assert scaled_size(frame.camera) == (MAX_SIDE, 100)
+    assert scaled_size(frame.camera.size) == (MAX_SIDE, 100)
     (region,) = dynamic_regions(frame.static_mask, frame.camera)  # the other one is too small
     expected = np.zeros((100, MAX_SIDE), bool)
     expected[20:40, 50:100] = True

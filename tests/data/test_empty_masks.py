@@ -8,7 +8,7 @@ import torch
 from tests.scenes import make_camera
 from warpgs.captures.check import quick_findings
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.dynamic_regions import dynamic_counts
+from warpgs.data.dynamic_regions import dynamic_counts, dynamic_regions
 from warpgs.data.empty_masks import wrongly_empty
 
 HEIGHT, WIDTH = make_camera().height, make_camera().width
@@ -31,7 +31,10 @@ def capture_of(*boxes, cameras=None):
 
 def untrusted(*boxes, **options):
     capture = capture_of(*boxes, **options)
-    masks = {f.name: dynamic_counts(f.static_mask, f.camera) for f in capture.frames(capture.train)}
+    masks = {
+        f.name: dynamic_counts(f.static_mask, dynamic_regions(f.static_mask, f.camera))
+        for f in capture.frames(capture.train)
+    }
     return [int(name.removeprefix("frame_")) for name in wrongly_empty(capture.cameras, masks)]
 
 

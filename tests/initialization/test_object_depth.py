@@ -287,7 +287,7 @@ def test_an_object_is_followed_through_the_frames_of_one_camera():
 
 
 def test_cameras_are_followed_on_all_cores_with_the_results_of_one(monkeypatch):
-    """Frames that are not resident are read by several threads at once."""
+    """These are all threads: frames, which several threads read, were read before."""
     masks, images = two_balls(np.linspace(-60, -33, NUM))
     capture = capture_of(masks, images=images)
     cameras = {name: dataclasses.replace(c, id=k % 3) for k, (name, c) in enumerate(capture.cameras.items())}
@@ -300,6 +300,7 @@ def test_cameras_are_followed_on_all_cores_with_the_results_of_one(monkeypatch):
 
     monkeypatch.setattr(objects, "find_objects", find)
     monkeypatch.setattr(launch, "_num_cores", lambda: 2)
+    monkeypatch.setattr(views, "in_threads", lambda *_: pytest.fail("threads within threads"))
     found = module.find_all_objects(views)
     assert len(found) == len(expected) > 3
     for item, other in zip(found, expected, strict=True):

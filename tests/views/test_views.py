@@ -13,7 +13,7 @@ from tests.scenes import along_z
 from warpgs.cameras import Camera
 from warpgs.captures.opening import load_capture
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.dynamic_regions import dynamic_counts
+from warpgs.data.dynamic_regions import dynamic_counts, dynamic_regions
 from warpgs.distortion import Distortion
 from warpgs.model.poses import PoseCorrections
 from warpgs.views import views as module
@@ -374,7 +374,9 @@ def test_a_glance_holds_the_mask_and_a_small_image_of_a_view(capture, resident_b
     views = views_of(capture, resident_bytes)
     for glance, view, name in zip(views.glances, views, capture.train, strict=True):
         assert torch.equal(glance.static_mask, view.static_mask)
-        assert glance.counts == dynamic_counts(view.static_mask, view.camera)
+        regions = dynamic_regions(view.static_mask, view.camera)
+        assert np.array_equal(glance.regions, regions)
+        assert glance.counts == dynamic_counts(view.static_mask, regions)
         assert glance.has_depth == (capture.frame(name).inverse_depth is not None)
         assert glance.colors.shape[:2] == glance.is_static.shape
         assert abs(glance.colors / 255.0 - view.image.numpy()).mean() < 0.5

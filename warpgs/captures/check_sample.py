@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from warpgs.data.capture import Capture, Frame
-from warpgs.data.dynamic_regions import DynamicCounts, dynamic_counts
+from warpgs.data.dynamic_regions import DynamicCounts, dynamic_counts, dynamic_regions
 from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.resized import reduced_capture, reduced_frame
 from warpgs.data.sampling import evenly_spaced
@@ -76,7 +76,9 @@ class Sample:
             self._frames[name] = reduced_frame(frame, self.capture.cameras[name])
         counts = None
         if frame.static_mask is not None and self._whole.assumption == "masks":
-            counts = dynamic_counts(frame.static_mask, frame.camera, frame.inverse_depth)
+            counts = dynamic_counts(
+                frame.static_mask, dynamic_regions(frame.static_mask, frame.camera), frame.inverse_depth
+            )
         return Content(None, frame.inverse_depth is not None, counts)
 
     def _read(self, name: str) -> Frame:

@@ -1,6 +1,7 @@
 """Connected regions of what moves, in masks that are scaled down."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -27,15 +28,15 @@ MIN_KNOWN_FRACTION = 0.1
 known only where nothing moves."""
 
 
-def scaled_size(camera: Camera) -> tuple[int, int]:
-    """(width, height) of the scaled mask of a camera's frame."""
-    return size_within(camera.size, MAX_SIDE)
+def scaled_size(size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of the scaled mask of a frame of this size."""
+    return size_within(size, MAX_SIDE)
 
 
 def dynamic_regions(static_mask: Bool[Tensor, "H W"], camera: Camera) -> list[Bool[np.ndarray, "h w"]]:
     """The connected regions of a camera's scaled mask, on the CPU, that are large enough."""
     dynamic = (~static_mask.numpy()).astype(np.uint8)
-    dynamic = cv2.resize(dynamic, scaled_size(camera), interpolation=cv2.INTER_NEAREST_EXACT)
+    dynamic = cv2.resize(dynamic, scaled_size(camera.size), interpolation=cv2.INTER_NEAREST_EXACT)
     return connected_regions(dynamic > 0, math.ceil(MIN_AREA * dynamic.size))
 
 
@@ -59,10 +60,12 @@ class DynamicCounts(NamedTuple):
 
 
 def dynamic_counts(
-    static_mask: Bool[Tensor, "H W"], camera: Camera, inverse_depth: Float[Tensor, "H W"] | None = None
+    static_mask: Bool[Tensor, "H W"],
+    regions: Sequence[Bool[np.ndarray, "h w"]],
+    inverse_depth: Float[Tensor, "H W"] | None = None,
 ) -> DynamicCounts:
-    """Counts what the mask of a frame marks as dynamic; all tensors are on the CPU."""
-    regions, is_dynamic = dynamic_regions(static_mask, camera), ~static_mask
+    """Counts what the mask of a frame marks as dynamic, with its ``dynamic_regions``; all tensors are on the CPU."""
+    is_dynamic = ~static_mask
     with_depth = 0 if inverse_depth is None else int((inverse_depth.isfinite() & is_dynamic).sum())
     pixels = int(is_dynamic.sum())
     return DynamicCounts(len(regions), sum(map(is_cut, regions)), pixels, pixels / is_dynamic.numel(), with_depth)

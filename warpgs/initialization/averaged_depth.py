@@ -97,7 +97,7 @@ def without_rims(inverse_depth: Float[Tensor, "H W"], static_mask: Bool[Tensor, 
 def _scaled_depth(view: View, alignment: Float[Tensor, "2"], camera: Camera) -> Float[np.ndarray, "h w"]:
     """A view's aligned depth at the pixels of its scaled mask."""
     depth = metric_depth(view.inverse_depth, alignment).cpu().numpy()
-    return cv2.resize(depth, scaled_size(camera), interpolation=cv2.INTER_NEAREST)
+    return cv2.resize(depth, scaled_size(camera.size), interpolation=cv2.INTER_NEAREST)
 
 
 def _mean_known(depths: Float[np.ndarray, " P"]) -> float:

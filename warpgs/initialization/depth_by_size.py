@@ -55,7 +55,7 @@ def paint(
     """
     for index, found in values.items():
         if index not in images:
-            images[index] = torch.full(scaled_size(views.camera(index))[::-1], torch.nan, dtype=torch.float32)
+            images[index] = torch.full(scaled_size(views.camera(index).size)[::-1], torch.nan, dtype=torch.float32)
         image = images[index].view(-1)
         pixels = torch.from_numpy(item.pixels[index]).long()
         image[pixels] = torch.where(image[pixels].isnan(), found, image[pixels])

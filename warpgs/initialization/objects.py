@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Int
 
-from warpgs.data.dynamic_regions import MIN_FRAMES, dynamic_regions, is_cut, scaled_size
+from warpgs.data.dynamic_regions import MIN_FRAMES, is_cut, scaled_size
 from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between
 from warpgs.runtime.launch import on_all_cores
 from warpgs.views.glance import Glance
@@ -58,13 +58,9 @@ def find_objects(views: Views, order: Sequence[int]) -> list[MovingObject]:
         views: The training views.
         order: Indices of those of one camera, by time or backward in time.
     """
-    follower, glances = _Follower(views), views.glances
-
-    def regions_of(index: int) -> list[Bool[np.ndarray, "h w"]]:
-        return dynamic_regions(glances[index].static_mask, views.camera(index))
-
-    for index, regions in zip(order, views.in_threads(regions_of, order), strict=True):
-        follower.add(index, regions)
+    follower = _Follower(views)
+    for index in order:
+        follower.add(index, views.glances[index].regions)
     return follower.objects
 
 
@@ -103,7 +99,7 @@ class _Follower:
 
     def add(self, index: int, regions: list[Bool[np.ndarray, "h w"]]) -> None:
         """Goes on to the training frame of an index, which shows these regions."""
-        alone, labels = set(), np.full(scaled_size(self._views.camera(index))[::-1], NOTHING)
+        alone, labels = set(), np.full(scaled_size(self._views.camera(index).size)[::-1], NOTHING)
         for region, candidates in zip(regions, self._candidates(regions), strict=True):
             if len(candidates) > 1 and not any(self.objects[k].is_mixture for k in candidates):
                 self._divide(region, candidates, index, labels)

@@ -66,7 +66,7 @@ def _static_points(capture: Capture, views: Views, index: int) -> Points:
     camera = views.camera(index)
     row, column, depth, inside = camera.project(capture.points[:: -(-len(capture.points) // MAX_POINTS) or 1])
     shown = inside & views.glances[index].static_mask[row, column]
-    width, height = scaled_size(camera)
+    width, height = scaled_size(camera.size)
     row, column = row[shown] * height // camera.height, column[shown] * width // camera.width
     return row.int(), column.int(), depth[shown]
 
@@ -125,7 +125,7 @@ class ObjectView:
     """
 
     def __init__(self, pixels: Int[np.ndarray, " P"], camera: Camera) -> None:
-        self._camera = camera.resized(*scaled_size(camera))
+        self._camera = camera.resized(*scaled_size(camera.size))
         self.time, self.size = camera.time, self._camera.size
         rows, columns = np.divmod(pixels, self._camera.width)
         self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()

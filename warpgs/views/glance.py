@@ -1,6 +1,8 @@
 """What is kept of every view before training: enough for the steps that look at all of them, without their pixels."""
 
+import math
 import zlib
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -11,7 +13,7 @@ from torch import Tensor
 
 from warpgs.cameras import Camera
 from warpgs.data.capture import Frame
-from warpgs.data.dynamic_regions import DynamicCounts, dynamic_counts, scaled_size
+from warpgs.data.dynamic_regions import DynamicCounts, dynamic_counts, dynamic_regions, scaled_size
 from warpgs.data.optical_flow import grey_levels
 
 from .pixels import Pixels
@@ -30,6 +32,7 @@ class Glance(NamedTuple):
         has_depth: Whether its inverse depth is known anywhere, before objects get one.
         size: (width, height) of the view [px].
         packed_mask: Its static mask, compressed.
+        packed_regions: Its ``dynamic_regions``, compressed.
         packed_grey: Where a region is dynamic, the image in grey levels at the size of the scaled mask, as PNG.
     """
 
@@ -39,14 +42,18 @@ class Glance(NamedTuple):
     has_depth: bool
     size: tuple[int, int]
     packed_mask: bytes
+    packed_regions: bytes
     packed_grey: UInt8[np.ndarray, " B"] | None
 
     @property
     def static_mask(self) -> Bool[Tensor, "H W"]:
         """[H, W] true where static."""
-        width, height = self.size
-        bits = np.frombuffer(zlib.decompress(self.packed_mask), np.uint8)
-        return torch.from_numpy(np.unpackbits(bits, count=width * height).view(bool).reshape(height, width))
+        return torch.from_numpy(_unpacked(self.packed_mask, 1, self.size)[0])
+
+    @property
+    def regions(self) -> list[Bool[np.ndarray, "h w"]]:
+        """The ``dynamic_regions``, [h, w] at the size of the scaled mask."""
+        return [*_unpacked(self.packed_regions, self.counts.regions, scaled_size(self.size))]
 
     @property
     def grey(self) -> UInt8[np.ndarray, "h w"]:
@@ -57,22 +64,33 @@ class Glance(NamedTuple):
         return levels
 
 
+def _packed(masks: Sequence[Bool[np.ndarray, "h w"]]) -> bytes:
+    return zlib.compress(np.packbits(np.array(masks, bool)).data, 1)
+
+
+def _unpacked(packed: bytes, count: int, size: tuple[int, int]) -> Bool[np.ndarray, "count h w"]:
+    shape = (count, size[1], size[0])
+    bits = np.unpackbits(np.frombuffer(zlib.decompress(packed), np.uint8), count=math.prod(shape))
+    return bits.view(bool).reshape(shape)
+
+
 def glance_at(pixels: Pixels, camera: Camera) -> Glance:
     """The glance at a view, from its pixels in host memory and its camera."""
     width, height = camera.size
     small = (min(WIDTH, width), max(1, round(height * min(WIDTH, width) / width)))
     mask = pixels.static_mask.numpy()
     static = cv2.resize(mask.astype(np.float32), small, interpolation=cv2.INTER_AREA)
-    counts, grey = dynamic_counts(pixels.static_mask, camera), None
-    if counts.regions:
-        levels = grey_levels(Frame("", camera, pixels.image), scaled_size(camera))
+    regions, grey = dynamic_regions(pixels.static_mask, camera), None
+    if regions:
+        levels = grey_levels(Frame("", camera, pixels.image), scaled_size(camera.size))
         grey = cv2.imencode(".png", levels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
     return Glance(
         cv2.resize(pixels.image.numpy(), small, interpolation=cv2.INTER_AREA),
         static >= 1.0,
-        counts,
+        dynamic_counts(pixels.static_mask, regions),
         not bool(pixels.inverse_depth.isnan().all()),
         (width, height),
-        zlib.compress(np.packbits(mask).data, 1),
+        _packed([mask]),
+        _packed(regions),
         grey,
     )
