@@ -73,24 +73,6 @@ def test_a_missing_or_mistyped_property_is_named(path, name):
         read_standard(path)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("name", ["means", "quats", "sh"])
-def test_values_that_are_not_finite_are_refused(path, name, value):
-    cloud = scenes.cloud(4)
-    values = getattr(cloud, name).copy()
-    values[2] = value
-    write_standard(path, dataclasses.replace(cloud, **{name: values}))
-    with pytest.raises(ValueError, match="1 Gaussians with values that are not finite"):
-        read_standard(path)
-
-
-def test_a_zero_quaternion_is_refused(path):
-    cloud = scenes.cloud(4)
-    write_standard(path, dataclasses.replace(cloud, quats=np.zeros((4, 4), np.float32)))
-    with pytest.raises(ValueError, match="4 Gaussians with values that are not finite"):
-        read_standard(path)
-
-
 def test_a_file_without_vertices_is_refused(path):
     write_ply(path, {"face": np.zeros(1, [("x", "<f4")])})
     with pytest.raises(ValueError, match="has no element vertex"):

@@ -44,11 +44,6 @@ def _lengths(flow: Float[np.ndarray, "H W 2"]) -> Float[np.ndarray, "H W"]:
     return np.sqrt(flow[..., 0] ** 2 + flow[..., 1] ** 2)
 
 
-def grey_at(frame: Frame, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"]:
-    """A frame in grey levels with even contrast, as optical flow wants it, resized to (width, height)."""
-    return even_contrast(grey_levels(frame, size))
-
-
 def grey_levels(frame: Frame, size: tuple[int, int]) -> UInt8[np.ndarray, "H W"]:
     """A frame in grey levels, resized to (width, height)."""
     return cv2.resize(cv2.cvtColor(frame.image.numpy(), cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)

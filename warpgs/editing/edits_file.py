@@ -49,7 +49,7 @@ def edits_in_use(folder: Path, editing: Editing, scene: TrainedScene) -> Edits:
         _check_effect(editing.given, editing.given)
         return editing.given
     given = {name: getattr(editing.given, name) for name in names_of(editing.given)}
-    saved, identity = _read(path)
+    saved, identity = read_edits(path)
     if dataclasses.replace(saved, **{name: getattr(Edits(), name) for name in given}).by_number:
         _check_identity(path, identity, identity_of(scene))
     edits = dataclasses.replace(saved, **given)
@@ -80,17 +80,12 @@ def save_edits(folder: Path, editing: Editing, edits: Edits, scene: TrainedScene
     return path
 
 
-def read_edits(path: Path) -> Edits:
-    """The edits of a file.
+def read_edits(path: Path) -> tuple[Edits, Identity | None]:
+    """The edits of a file and the scene that they are for; None if the file does not say it.
 
     Raises:
         ValueError: If it is missing, damaged or of another version, or has edits that are unknown or not valid.
     """
-    return _read(path)[0]
-
-
-def _read(path: Path) -> tuple[Edits, Identity | None]:
-    """The edits of a file and the scene that they are for; None if the file does not say it."""
     values = read_json(path, max_bytes=MAX_BYTES)
     if values.pop("format", None) != "warpgs edits":
         raise ValueError(f"{path} is not a file of edits of warpgs")

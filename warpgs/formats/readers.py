@@ -16,7 +16,7 @@ from .read_sog import read_sog
 from .rotation import Y_DOWN_TO_Y_UP, rotated
 from .splat import read_splat
 from .spz import read_spz
-from .standard import parse_standard
+from .standard import read_standard
 
 MAX_LOGIT = 80.0
 """Maximum magnitude of an opacity's logit: its opacity is 1 in single precision."""
@@ -39,7 +39,7 @@ def parse_ply(path: Path) -> Cloud:
     require_file(path, MAX_FILE)
     header = read_start(path, MAX_HEADER).split(b"end_header")[0]
     is_compressed = b"\nelement chunk " in header
-    cloud = (read_compressed if is_compressed else parse_standard)(path)
+    cloud = (read_compressed if is_compressed else read_standard)(path)
     return cloud.replaced(
         logit_opacities=np.clip(cloud.logit_opacities, -MAX_LOGIT, MAX_LOGIT),
         log_scales=np.maximum(cloud.log_scales, np.float32(np.log(MIN_SCALE))),

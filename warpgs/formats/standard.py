@@ -56,19 +56,11 @@ def write_standard(path: Path, cloud: Cloud) -> int:
 
 
 def read_standard(path: Path) -> Cloud:
-    """Reads the Gaussians of a PLY file of 3DGS, of any degree.
+    """Reads the Gaussians of a PLY file of 3DGS, of any degree, also those with values that are not finite.
 
     Raises:
-        ValueError: If it is another file, damaged, or has values that are not finite; the message names it.
+        ValueError: If it is another file or damaged; the message names it.
     """
-    cloud = parse_standard(path)
-    if not cloud.finite.all():
-        raise ValueError(f"{path} has {np.count_nonzero(~cloud.finite):,} Gaussians with values that are not finite")
-    return cloud
-
-
-def parse_standard(path: Path) -> Cloud:
-    """As ``read_standard``, but also with values that are not finite."""
     tables = read_ply(path)
     if "vertex" not in tables:
         raise ValueError(f"{path} has no element vertex")
