@@ -25,9 +25,8 @@ from warpgs.data.units import scene_units
 from warpgs.files import natural_order, read_array
 
 from .listed import find_file
-from .matrices import scale_note, scale_of_rotations, without_scale
 from .options import LoadOptions
-from .posed import PosedFrame, World, every_eighth, plain_names, posed_capture, world_to_camera
+from .posed import PosedFrame, World, every_eighth, plain_names, posed_capture, world_to_cameras
 from .turned import turning_notes
 
 INDEX = "poses_bounds.npy"
@@ -95,15 +94,10 @@ def read_poses(path: Path) -> Poses:
         raise ValueError(f"{path} must hold finite numbers of shape [N, 17] with N > 0, got {list(rows.shape)}")
     matrices, bounds = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:]
     down, right, backward, center = (matrices[:, :, k : k + 1] for k in range(4))
-    try:
-        found = np.concatenate([right, down, -backward, center], 2)
-        scale = scale_of_rotations(found)
-        poses = [world_to_camera(without_scale(pose, scale)) for pose in found]
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    poses, notes = world_to_cameras(path, np.concatenate([right, down, -backward, center], 2))
     if not ((bounds[:, 0] > 0) & (bounds[:, 1] > bounds[:, 0])).all() or not (matrices[:, :, 4] > 0).all():
         raise ValueError(f"{path}: bounds, sizes and focal lengths must be positive, and near less than far")
-    return Poses(np.array(poses), bounds, matrices[:, :, 4], scale_note(path.name, scale))
+    return Poses(np.array(poses), bounds, matrices[:, :, 4], notes)
 
 
 def _image_folder(root: Path, factor: int | None) -> Path:

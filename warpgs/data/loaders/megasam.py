@@ -12,9 +12,8 @@ from warpgs.data.lens import Lens
 from warpgs.data.npz import read_npz
 from warpgs.data.resized import inverse_of, resize
 
-from .matrices import scale_note, scale_of_rotations, without_scale
 from .options import LoadOptions
-from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_camera
+from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_cameras
 
 SUFFIXES = ("_sgd_cvd_hr.npz", "_droid.npz")
 """Ends of the names of the files that MegaSaM writes, the better one first."""
@@ -53,11 +52,9 @@ class MegaSamLoader:
         focal, center = (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2]))
         try:
             lens = Lens(width, height, focal, center).checked()
-            matrices = matrices[:, :3].astype(np.float64)
-            scale = scale_of_rotations(matrices)
-            poses = [world_to_camera(without_scale(matrix, scale)) for matrix in matrices]
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
+        poses, notes = world_to_cameras(path, matrices[:, :3].astype(np.float64))
         frames = [
             PosedFrame(
                 f"{k:05d}",
@@ -70,7 +67,7 @@ class MegaSamLoader:
             for k in range(count)
         ]
         val = every_eighth([frame.name for frame in frames])
-        world = World(points=None, notes=scale_note(path.name, scale), conventions=CONVENTIONS)
+        world = World(points=None, notes=notes, conventions=CONVENTIONS)
         return posed_capture(root, frames, val, world, options)
 
 

@@ -25,6 +25,7 @@ from warpgs.data.units import SceneUnits, scene_units, units_around
 from warpgs.files import MAX_NUMBER
 
 from .listed import without_image_suffix
+from .matrices import scale_note, scale_of_rotations, without_scale
 from .options import LoadOptions
 
 HOLDOUT = 8
@@ -202,6 +203,22 @@ def world_to_camera(camera_to_world: Float[np.ndarray, "3 4"]) -> Float[np.ndarr
     if not is_rotation(rotation):
         raise ValueError(f"the pose is not a rotation and a translation: {_flaw(rotation)}")
     return np.hstack([rotation, -rotation @ camera_to_world[:, 3:]])
+
+
+def world_to_cameras(
+    path: Path, camera_to_worlds: Float[np.ndarray, "N 3 4"]
+) -> tuple[list[Float[np.ndarray, "3 4"]], tuple[str, ...]]:
+    """``world_to_camera`` of the poses of a file, whose rotations may have one scale, and the note on it.
+
+    Raises:
+        ValueError: As there; the message names the file.
+    """
+    try:
+        scale = scale_of_rotations(camera_to_worlds)
+        poses = [world_to_camera(without_scale(pose, scale)) for pose in camera_to_worlds]
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return poses, scale_note(path.name, scale)
 
 
 def _flaw(matrix: Float[np.ndarray, "3 3"]) -> str:

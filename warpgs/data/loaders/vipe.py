@@ -23,9 +23,8 @@ from warpgs.data.time_source import TimeSource, with_steps
 from warpgs.data.video_frames import VideoFrames
 from warpgs.files import read_bounded
 
-from .matrices import scale_note, scale_of_rotations, without_scale
 from .options import LoadOptions
-from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_camera
+from .posed import PosedFrame, Size, World, every_eighth, posed_capture, world_to_cameras
 
 PINHOLE = "PINHOLE"
 
@@ -116,12 +115,8 @@ def _poses(path: Path) -> tuple[dict[int, Float[np.ndarray, "3 4"]], tuple[str, 
     indices, matrices = _indexed(path)
     if matrices.shape[1:] != (4, 4):
         raise ValueError(f"{path}: data must have shape [N, 4, 4], got {list(matrices.shape)}")
-    try:
-        scale = scale_of_rotations(matrices[:, :3])
-        poses = (world_to_camera(without_scale(matrix[:3], scale)) for matrix in matrices)
-        return {int(k): pose for k, pose in zip(indices, poses, strict=True)}, scale_note(path.name, scale)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    poses, notes = world_to_cameras(path, matrices[:, :3])
+    return {int(k): pose for k, pose in zip(indices, poses, strict=True)}, notes
 
 
 def _lenses(path: Path, size: Size) -> dict[int, Lens]:

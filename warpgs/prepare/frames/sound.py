@@ -19,6 +19,8 @@ from jaxtyping import Float
 from warpgs.data.video_frames import READ_LOCAL_FILES
 from warpgs.errors import one_line
 
+from .video import decoded
+
 RATE, WINDOW, HOP = 8000, 256, 32
 """Samples per second, per window of the spectrum, and between windows: onsets every 4 ms."""
 
@@ -99,21 +101,16 @@ def _read_pieces(source: Path) -> Iterator[tuple[float, Float[np.ndarray, " N"]]
     resamplers: dict[tuple[str, str, int], Any] = {}  # the format may change within a stream
     with av.open(str(source), options=READ_LOCAL_FILES) as container:
         end: float | None = None
-        for packet in container.demux(container.streams.audio[0]) if container.streams.audio else ():
-            try:
-                frames = packet.decode()
-            except av.FFmpegError:
+        for frame in decoded(container, container.streams.audio[0]) if container.streams.audio else ():
+            if frame.time is None:
                 continue
-            for frame in frames:
-                if frame.time is None:
-                    continue
-                end = frame.time + MAX_SECONDS if end is None else end
-                if frame.time > end:
-                    return
-                form = frame.format.name, frame.layout.name, frame.sample_rate
-                if form not in resamplers:
-                    resamplers[form] = av.AudioResampler(format="flt", layout="mono", rate=RATE)
-                yield from ((float(out.time), out.to_ndarray()[0]) for out in resamplers[form].resample(frame))
+            end = frame.time + MAX_SECONDS if end is None else end
+            if frame.time > end:
+                return
+            form = frame.format.name, frame.layout.name, frame.sample_rate
+            if form not in resamplers:
+                resamplers[form] = av.AudioResampler(format="flt", layout="mono", rate=RATE)
+            yield from ((float(out.time), out.to_ndarray()[0]) for out in resamplers[form].resample(frame))
 
 
 def _onsets(samples: Float[np.ndarray, " N"]) -> Float[np.ndarray, "B T"]:

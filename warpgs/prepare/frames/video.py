@@ -162,6 +162,15 @@ def _seconds(stamp: int | None, stream: Any) -> Fraction | None:
     return None if stamp is None else stamp * Fraction(str(stream.time_base))
 
 
+def decoded(container: Any, stream: Any) -> Iterator[Any]:
+    """The frames of a stream of images or sound; packets that are damaged are skipped."""
+    for packet in container.demux(stream):
+        frames: list[Any] = []
+        with suppress(av.FFmpegError):
+            frames = packet.decode()
+        yield from frames
+
+
 def _decode(container: Any, stream: Any, stamps: list[Fraction], timeline: Timeline) -> Iterator[tuple[Fraction, Any]]:
     """Times and frames of the selected part, in order; damaged frames are skipped."""
     begin = next(iter(timeline.intervals))
@@ -169,18 +178,12 @@ def _decode(container: Any, stream: Any, stamps: list[Fraction], timeline: Timel
     if begin > 0:
         with suppress(av.FFmpegError):  # then it is decoded from its start
             container.seek(int((begin + stamps[0]) / Fraction(str(stream.time_base))), stream=stream)
-    last, index = Fraction(-1), 0
-    for packet in container.demux(stream):
-        try:
-            frames = packet.decode()
-        except av.FFmpegError:
-            continue
-        for frame in frames:
-            stamp = _seconds(frame.pts, stream)
-            if stamp not in known:  # no usable time stamps: count
-                stamp = stamps[min(index, len(stamps) - 1)]
-            index += 1
-            time = stamp - stamps[0]
-            if time in timeline.intervals and time > last:
-                last = time
-                yield time, frame
+    last = Fraction(-1)
+    for index, frame in enumerate(decoded(container, stream)):
+        stamp = _seconds(frame.pts, stream)
+        if stamp not in known:  # no usable time stamps: count
+            stamp = stamps[min(index, len(stamps) - 1)]
+        time = stamp - stamps[0]
+        if time in timeline.intervals and time > last:
+            last = time
+            yield time, frame
