@@ -1,7 +1,7 @@
 """Initial Gaussians: from points, and from the depth of dynamic pixels."""
 
 import dataclasses
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import pytest
 import torch
@@ -492,7 +492,7 @@ def test_motion_can_be_fitted_where_masks_and_depth_show_it(assume, depth, can):
 @pytest.mark.parametrize("steps", [0, 2])
 def test_a_fit_of_the_deformation_which_takes_a_while_is_announced(data, tmp_path, steps):
     config = dataclasses.replace(tiny.CONFIG, schedule=dataclasses.replace(tiny.SCHEDULE, fit_motion=steps))
-    trainer, logger = tiny.trainer(data, tmp_path / "run", config), Mock(spec=TrainingLogger)
+    trainer, logger = tiny.trainer(data, tmp_path / "run", config), MagicMock(spec=TrainingLogger)
     assert trainer._add_dynamic_gaussians(logger=logger)
     lines = [call.args[0] for call in logger.log.call_args_list]
     assert lines == ["before stage I, 2 steps fit the deformation to points on what moves"] * (steps > 0)
@@ -502,7 +502,7 @@ def test_a_fit_of_the_deformation_that_is_not_used_is_told(data, tmp_path, monke
     monkeypatch.setattr(motion_fit, "MIN_KEPT", 1.1)
     schedule = dataclasses.replace(tiny.SCHEDULE, fit_motion=2)
     trainer = tiny.trainer(data, tmp_path / "run", dataclasses.replace(tiny.CONFIG, schedule=schedule))
-    logger = Mock(spec=TrainingLogger)
+    logger = MagicMock(spec=TrainingLogger)
     assert trainer._add_dynamic_gaussians(logger=logger)
     assert logger.log.call_args.args[0].startswith("warning: no deformation follows what moves")
     assert len(trainer.scene.dynamic)
@@ -521,7 +521,7 @@ class Still(torch.nn.Module):
 def test_nothing_is_told_of_a_fit_of_a_deformation_without_parameters(data, tmp_path, monkeypatch):
     monkeypatch.setitem(FIELDS, "still", Still)
     config = dataclasses.replace(tiny.CONFIG, model=dataclasses.replace(tiny.MODEL, deformation="still"))
-    trainer, logger = tiny.trainer(data, tmp_path / "run", config), Mock(spec=TrainingLogger)
+    trainer, logger = tiny.trainer(data, tmp_path / "run", config), MagicMock(spec=TrainingLogger)
     assert trainer._add_dynamic_gaussians(logger=logger)
     assert logger.log.call_args_list == []
     assert len(trainer.scene.dynamic)

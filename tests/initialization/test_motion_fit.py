@@ -9,7 +9,7 @@ from tests import plain
 from tests.scenes import error, generator, relative_error
 from warpgs.initialization import motion_fit
 from warpgs.initialization.dynamic_points import DynamicPoints, to_canonical
-from warpgs.initialization.motion_fit import MAX_ERROR, Observed, fit_motion
+from warpgs.initialization.motion_fit import MAX_ERROR, Observed, fit_motion, never
 from warpgs.model.fields import make_deformation
 from warpgs.model.trunk import Trunk
 
@@ -52,7 +52,7 @@ def new_deformation(device="cpu", **model):
     return make_deformation(dataclasses.replace(MODEL, **model), *box)
 
 
-def fit(found, deformation, num_steps=300, is_stopped=bool, graph=True):
+def fit(found, deformation, num_steps=300, is_stopped=never, graph=True):
     schedule = dataclasses.replace(plain.config().schedule, fit_motion=num_steps)
     config = dataclasses.replace(plain.config(), schedule=schedule, graph=graph)
     fitted = fit_motion(deformation, Observed(found, TIMES, VIEW_SIZE), config, generator(), is_stopped)
@@ -220,8 +220,8 @@ def test_the_points_of_each_frame_are_subsampled(monkeypatch):
 
 def test_a_fit_that_is_stopped_leaves_the_deformation_as_it_was():
     deformation, steps = new_deformation(), []
-    assert fit(FOUND, deformation, is_stopped=lambda: steps.append(0) or len(steps) == 7) is None
-    assert len(steps) == 7
+    assert fit(FOUND, deformation, is_stopped=lambda done: steps.append(done) or len(steps) == 7) is None
+    assert steps == pytest.approx([k / 300 for k in range(1, 8)])
     for ours, new in zip(deformation.parameters(), new_deformation().parameters(), strict=True):
         assert torch.equal(ours, new)
 

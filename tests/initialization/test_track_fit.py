@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from unittest.mock import Mock
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -117,7 +117,7 @@ def test_without_tracks_of_known_depth_the_fit_is_as_without_any(with_depth, cou
 def test_a_fit_stops_while_it_follows_tracks():
     deformation, stops = new_deformation(), iter([False, False, True])
     before = [parameter.clone() for parameter in deformation.parameters()]
-    assert fit_motion(deformation, observed(), config_of(50), generator(), lambda: next(stops)) is None
+    assert fit_motion(deformation, observed(), config_of(50), generator(), lambda done: next(stops)) is None
     assert all(torch.equal(*pair) for pair in zip(before, deformation.parameters(), strict=True))
 
 
@@ -133,7 +133,7 @@ def test_a_training_says_how_many_tracks_its_deformation_follows(tmp_path):
     root = tiny.write(tmp_path / "capture")
     visible = np.ones((5, tiny.SCENE.num_frames), bool)
     write_tracks(root, np.full((*visible.shape, 2), 1.0), visible, (32, 24))
-    trainer, logger = tiny.trainer(root, tmp_path / "run"), Mock(spec=TrainingLogger)
+    trainer, logger = tiny.trainer(root, tmp_path / "run"), MagicMock(spec=TrainingLogger)
     trainer._add_dynamic_gaussians(logger=logger)
     logger.log.assert_called_with("the deformation follows 0 of 5 tracks")
 

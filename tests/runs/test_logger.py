@@ -263,3 +263,38 @@ def test_without_a_folder_there_are_no_events(tmp_path, monkeypatch):
         log.report(status(50))
         log.add_image("image", np.zeros((2, 2, 3), np.uint8), 50)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fit_between_iterations_is_shown_by_name_and_its_time_is_none_of_their_speed(capsys, clock):
+    with TrainingLogger(None, 500, 0) as log:
+        clock[0] += 10.0
+        log.report(status(50))
+        with log.fitting("fitting what moves") as show:
+            for percent in (25, 26, 75, 100):
+                clock[0] += 20.0 if percent != 26 else 1.0
+                show(percent / 100)
+        clock[0] += 10.0
+        log.report(status(100))
+    assert capsys.readouterr().out.splitlines()[1:] == [
+        "fitting what moves: 25%  0:01:00 left",
+        "fitting what moves: 75%  0:00:14 left",
+        "fitting what moves: 100%  0:00:00 left",
+    ]
+    assert log._recent[-1] == (50, 10.0)
+
+
+def test_a_terminal_shows_the_bar_of_a_fit_instead_of_that_of_the_iterations(capsys, monkeypatch, clock):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    with TrainingLogger(None, 500, 0) as log:
+        with log.fitting("fitting what moves") as show:
+            clock[0] += 30.0
+            show(0.25)
+            log._bar.refresh()
+            during = capsys.readouterr().out
+        log._bar.refresh()
+        after = capsys.readouterr().out
+    assert re.search(r"fitting what moves.* 25/100.*%.*0:01:30", during)
+    assert "0/500" not in during.rpartition("fitting what moves")[2]
+    assert "0/500" in after

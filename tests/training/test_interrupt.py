@@ -9,7 +9,7 @@ import pytest
 from tests import tiny
 from warpgs.command_line.interrupt import Interrupt
 from warpgs.runs import checkpoint
-from warpgs.training import command
+from warpgs.training import command, trainer
 from warpgs.training import train as script
 from warpgs.training.step import Step
 from warpgs.training.train import TrainingInterrupted
@@ -168,3 +168,25 @@ def test_ctrl_c_is_recorded_while_another_thread_works():
         done.set()
         worker.join()
         assert interrupt.requested
+
+
+def test_ctrl_c_while_a_start_is_prepared_says_that_nothing_was_saved(config, monkeypatch, capsys):
+    monkeypatch.setattr(script, "prepare_start", lambda *_: press())
+    monkeypatch.setattr(command, "parse", lambda *_: config)
+    assert command.main([]) == 130
+    assert capsys.readouterr().err == f"train.py: {script.BEFORE}\n"
+    assert not config.out.exists()
+
+
+def test_ctrl_c_in_the_fit_of_what_moves_says_what_is_lost(config, monkeypatch, capsys):
+    def start(*arguments):
+        press()
+        return None if arguments[-1](0.5) else pytest.fail("not stopped")
+
+    config = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, fit_motion=3))
+    monkeypatch.setattr(trainer, "dynamic_start", start)
+    monkeypatch.setattr(command, "parse", lambda *_: config)
+    assert command.main([]) == 130
+    first = checkpoint.load(checkpoint.list_checkpoints(config.out)[-1]).metadata.iteration
+    goes_on = f"continue with warpgs train --resume {config.out}, which begins the fit of what moves anew"
+    assert f"stopped after iteration {first} of {tiny.LENGTH}; {goes_on}\n" in capsys.readouterr().err

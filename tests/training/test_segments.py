@@ -50,6 +50,17 @@ def test_dynamic_gaussians_of_each_segment_start_where_its_frames_show_them(data
         assert (nearest(others, 2) != segment).all()
 
 
+def test_the_fits_of_all_segments_are_one_progress(data, tmp_path):
+    trainer = tiny.trainer(data, tmp_path, CONFIG)
+    trainer.iteration, logger = trainer.protocol.stage1.start, MagicMock(spec=TrainingLogger)
+    trainer._add_dynamic_gaussians(logger=logger)
+    show = logger.fitting.return_value.__enter__.return_value
+    steps = CONFIG.schedule.fit_motion
+    assert [call.args[0] for call in show.call_args_list] == pytest.approx(
+        [k / (2 * steps) for k in range(1, 2 * steps + 1)]
+    )
+
+
 def test_gaussians_of_a_segment_count_by_the_images_in_which_they_are_there(data, tmp_path):
     trainer = tiny.trainer(data, tmp_path, CONFIG)
     trainer.iteration = trainer.protocol.stage1.start

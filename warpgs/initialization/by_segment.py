@@ -1,7 +1,8 @@
 """The dynamic Gaussians that stage I starts from, of each segment of time."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -16,6 +17,7 @@ from warpgs.views.part import Part
 from warpgs.views.views import Views
 
 from .initialize import DynamicStart, dynamic_gaussians
+from .motion_fit import IsStopped, never
 
 
 def dynamic_start(
@@ -25,19 +27,23 @@ def dynamic_start(
     alignments: Float[Tensor, "T 2"],
     deformation: nn.Module,
     generator: torch.Generator,
-    is_stopped: Callable[[], bool] = bool,
+    is_stopped: IsStopped = never,
 ) -> DynamicStart | None:
     """``dynamic_gaussians``, of several segments each by its own views and their times in its window."""
-    sources = (generator, is_stopped)
     if not isinstance(deformation, SegmentedDeformation):
-        return dynamic_gaussians(config, capture, views, alignments, deformation, *sources)
+        return dynamic_gaussians(config, capture, views, alignments, deformation, generator, is_stopped)
+
+    def is_stopped_in(segment: int, done: float) -> bool:
+        return is_stopped((segment + done) / deformation.num)
+
     found, networks = [], [deformation.of(segment) for segment in range(deformation.num)]
     for segment, network in enumerate(networks):
         part, indices = _part(capture, segment, deformation.num)
         if not indices:
             found.append(DynamicStart(Gaussians.empty(0, config.model.sh_degree)))
             continue
-        start = dynamic_gaussians(config, part, Part(views, indices), alignments[indices], network, *sources)
+        sources = (config, part, Part(views, indices), alignments[indices], network, generator)
+        start = dynamic_gaussians(*sources, partial(is_stopped_in, segment))
         if start is None:
             return None
         found.append(start)

@@ -1,7 +1,6 @@
 """The Gaussians that training starts from, of both branches."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -19,7 +18,7 @@ from warpgs.views.part import SomeViews
 from warpgs.views.views import Views
 
 from .dynamic_points import MAX_SCALE, DynamicPoints, gaussians_in_box, is_depth_known, unproject_pixels
-from .motion_fit import MAX_POINTS, Observed, fit_motion
+from .motion_fit import MAX_POINTS, IsStopped, Observed, fit_motion, never
 from .point_cloud import color_points, gaussians_at, random_points, scene_box, subsample
 from .sky import Sky, make_dome, without_points
 from .track_paths import dynamic_paths
@@ -117,7 +116,7 @@ def dynamic_gaussians(
     alignments: Float[Tensor, "T 2"],
     deformation: nn.Module,
     generator: torch.Generator,
-    is_stopped: Callable[[], bool] = bool,
+    is_stopped: IsStopped = never,
 ) -> DynamicStart | None:
     """Dynamic Gaussians at dynamic pixels, unprojected by aligned depth, to which the deformation may be fitted first.
 

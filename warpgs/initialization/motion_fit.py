@@ -66,6 +66,15 @@ MIN_KEPT = 0.3
 """Fraction of the points that a fitted deformation has to move to where they were seen, or it is not used."""
 
 
+IsStopped = Callable[[float], bool]
+"""Told after each step which fraction of the fit is done; whether to stop it."""
+
+
+def never(done: float) -> bool:
+    """An ``IsStopped`` that lets the fit go on."""
+    return False
+
+
 class Observed(NamedTuple):
     """What T training views, or all training views at each of T times, see of what moves.
 
@@ -100,7 +109,7 @@ def fit_motion(
     observed: Observed,
     config: TrainConfig,
     generator: torch.Generator,
-    is_stopped: Callable[[], bool] = bool,
+    is_stopped: IsStopped = never,
 ) -> MotionFit | None:
     """Fits a deformation to dynamic points, and moves these to canonical space.
 
@@ -113,7 +122,7 @@ def fit_motion(
         config: ``schedule.fit_motion`` is the number of steps of Adam, each on the points of one frame; ``graph``
             says whether they are replayed on CUDA.
         generator: CPU generator that chooses the frames.
-        is_stopped: Asked after each step whether to stop.
+        is_stopped: See ``IsStopped``.
 
     Returns:
         The points; None if stopped, and the deformation as it was, as it is where no points are moved.
@@ -149,7 +158,7 @@ def _fit(
     tracks: TrackFit | None,
     config: TrainConfig,
     generator: torch.Generator,
-    is_stopped: Callable[[], bool],
+    is_stopped: IsStopped,
 ) -> bool:
     """Takes the steps, on CUDA as replays of a graph, until stopped; whether all were taken."""
     device, num_steps = points.home.device, config.schedule.fit_motion
@@ -166,6 +175,7 @@ def _fit(
     losses = [(num_steps, partial(_loss, deformation, points, tracks, index))]
     if tracks is not None:
         losses.insert(0, (TRACK_STEPS * num_steps, partial(_loss_of_tracks, deformation, points, tracks, index)))
+    taken, total = 0, sum(count for count, _ in losses)
     for stage, (count, loss) in enumerate(losses):
         for step in range(count):
             progress = step / (GROWTH * count) if stage == 0 else 1.0
@@ -175,7 +185,8 @@ def _fit(
                 take_step()
             else:
                 graphs.run(stage, take_step)
-            if is_stopped():
+            taken += 1
+            if is_stopped(taken / total):
                 return False
     return True
 

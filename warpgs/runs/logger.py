@@ -5,7 +5,8 @@ import statistics
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 
@@ -24,7 +25,7 @@ NUM_RECENT = 20
 """Number of reports whose mean speed gives the remaining time: some include pruning or a checkpoint."""
 
 MAX_SLOWNESS = 5.0
-"""How much slower than the median a report counts: some include the compilation of kernels or the fit of motion."""
+"""How much slower than the median a report counts: some include the compilation of kernels."""
 
 LINE_EVERY = 10.0
 """Minimum time between lines if the output is not a terminal, which shows a bar instead [s]."""
@@ -164,6 +165,35 @@ class TrainingLogger:
         """Leaves out time in which nothing was trained [s]."""
         iteration, at = self._last
         self._last = (iteration, at + seconds)
+
+    @contextmanager
+    def fitting(self, name: str) -> Iterator[Callable[[float], None]]:
+        """Shows the progress of a fit between two iterations, whose time does not count in their speed.
+
+        Yields a function that takes the fraction of the fit that is done.
+        """
+        start = self._last_line = time.monotonic()
+        task = None
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, visible=False)
+            task = self._bar.add_task(name, total=100, status="%", left=UNKNOWN)
+
+        def show(done: float) -> None:
+            now = time.monotonic()
+            left = timedelta(seconds=round((now - start) * (1.0 - done) / done))
+            if self._bar is not None and task is not None:
+                self._bar.update(task, completed=round(100 * done), left=str(left))
+            elif now - self._last_line > LINE_EVERY:
+                self._last_line = now
+                self.log(f"{name}: {done:.0%}  {left} left")
+
+        try:
+            yield show
+        finally:
+            if self._bar is not None and self._task is not None and task is not None:
+                self._bar.remove_task(task)
+                self._bar.update(self._task, visible=True)
+            self.skip(time.monotonic() - start)
 
     def _write(self, status: Status, rate: float) -> None:
         values = {

@@ -39,11 +39,16 @@ from .trainer import Trainer
 Log = Callable[[str], None]
 """Receives lines for the user, such as ``print``."""
 
+BEFORE = "stopped before the first iteration, nothing was saved: give the same command again"
+"""What Ctrl-C ends with while a training is prepared."""
+
 FINISHED = "training is finished ({} iterations), and the run is evaluated again; a larger --iterations trains on"
 
 
 class TrainingInterrupted(KeyboardInterrupt):
     """Ctrl-C or SIGTERM stopped the training after an iteration, and a checkpoint of it was saved.
+
+    ``lost`` says what was stopped after that iteration and begins anew, for the message.
 
     Attributes:
         folder (Path): Run folder; ``TrainConfig(resume=folder)`` continues it.
@@ -51,8 +56,8 @@ class TrainingInterrupted(KeyboardInterrupt):
         num_iterations (int): Those of the whole run.
     """
 
-    def __init__(self, folder: Path, iteration: int, num_iterations: int) -> None:
-        goes_on = command("train", "--resume", folder)
+    def __init__(self, folder: Path, iteration: int, num_iterations: int, lost: str = "") -> None:
+        goes_on = command("train", "--resume", folder) + (f", which begins {lost} anew" if lost else "")
         super().__init__(f"stopped after iteration {iteration} of {num_iterations}; continue with {goes_on}")
         self.folder, self.iteration, self.num_iterations = folder, iteration, num_iterations
 
@@ -147,7 +152,9 @@ def _train(trainer: Trainer, is_changed: bool, callbacks: Sequence[Callback], qu
         trainer.step.release_graphs()
         interrupted = ranks.any_rank(not finished and interrupt.requested)
     if interrupted:
-        raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations)
+        is_fit_lost = trainer.config.schedule.fit_motion and trainer.iteration == trainer.protocol.stage1.start
+        lost = "the fit of what moves" if is_fit_lost else ""
+        raise TrainingInterrupted(run.folder, trainer.iteration, num_iterations, lost)
 
 
 def _too_many(trainer: Trainer) -> str:
@@ -198,7 +205,10 @@ def make_trainer(config: TrainConfig, log: Log | None = None, locks: contextlib.
     """
     with contextlib.ExitStack() as until_made:
         make = _begun if config.resume is None else _continued
-        return make(config, log or ignore, log is None, until_made if locks is None else locks)
+        try:
+            return make(config, log or ignore, log is None, until_made if locks is None else locks)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(str(stop) or BEFORE) from None
 
 
 def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitStack) -> Trainer:

@@ -183,18 +183,23 @@ class Trainer:
 
     def _add_dynamic_gaussians(self, interrupt: Interrupt | None = None, logger: TrainingLogger | None = None) -> bool:
         """Adds the dynamic Gaussians at the start of stage I, when depth is aligned; false if interrupted before."""
-        if logger is not None and (steps := self.config.schedule.fit_motion):
-            logger.log(f"before stage I, {steps:,} steps fit the deformation to points on what moves")
+        logger = logger or TrainingLogger(None, self.protocol.num_iterations, self.iteration, quiet=True)
         ranks.any_rank(False)  # finds a lost rank
         sources = (self.config, self.capture, self.views, self.alignments, self.scene.deformation)
-        found = dynamic_start(
-            *sources, self._generator("dynamic"), lambda: interrupt is not None and interrupt.requested
-        )
+        if steps := self.config.schedule.fit_motion:
+            logger.log(f"before stage I, {steps:,} steps fit the deformation to points on what moves")
+        with logger.fitting("fitting what moves") as show:
+
+            def is_stopped(done: float) -> bool:
+                show(done)
+                return interrupt is not None and interrupt.requested
+
+            found = dynamic_start(*sources, self._generator("dynamic"), is_stopped)
         if ranks.any_rank(found is None) or found is None:
             return False
-        if logger is not None and found.lacks_fit:
+        if found.lacks_fit:
             logger.log("warning: no deformation follows what moves: dynamic Gaussians start where frames show them")
-        if logger is not None and (tracks := self.capture.tracks) is not None:
+        if (tracks := self.capture.tracks) is not None:
             logger.log(f"the deformation follows {found.num_tracks:,} of {len(tracks.positions):,} tracks")
         self.scene.set_dynamic(found.gaussians)
         self._start_from(self.scene)
