@@ -136,6 +136,16 @@ def test_a_plan_knows_the_number_of_segments(data, monkeypatch):
     assert any("2 segments of about 4 times" in note for note in notes)
 
 
+@pytest.mark.parametrize(("most", "warns"), [(0, True), (1, False)])
+def test_a_limit_that_the_gaussians_of_all_segments_reach_at_the_start_is_told(data, most, warns):
+    capture = tiny.trainer(data, data, tiny.CONFIG).capture
+    start = tiny.MODEL.max_static_points + 2 * tiny.MODEL.dynamic_points
+    densify = dataclasses.replace(CONFIG.densify, max_gaussians=start + most)
+    notes = make_plan(dataclasses.replace(CONFIG, densify=densify), capture).notes
+    message = f"warning: --densify.max-gaussians {start} counts those of all segments and leaves none to add to"
+    assert any(note.startswith(message) for note in notes) == warns
+
+
 def test_a_run_that_is_resumed_says_its_number_of_segments(data):
     capture = tiny.trainer(data, data, tiny.CONFIG).capture
     for segments, told in ((2, True), (1, False)):

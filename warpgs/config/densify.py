@@ -29,7 +29,7 @@ class DensifyConfig:
     """After every ``every`` iterations and at the end, the longest axis of static Gaussians is cut to this many times
     their second longest, or to 20 pixels (0.1 of the extent) if that is longer. 0: never."""
     max_gaussians: int = 3_000_000
-    """Maximum number of Gaussians up to which both branches together grow."""
+    """Maximum number of Gaussians up to which the scene grows: both branches, and all segments of a long video."""
     min_pixels: int = 8
     """Minimum number of training pixels per Gaussian: densification stops where there are fewer, and at three Gaussians
     per pixel of an image. 0: no limit."""

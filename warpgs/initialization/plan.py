@@ -50,7 +50,7 @@ def make_plan(config: TrainConfig, capture: Capture) -> Planned:
     asked, num = config.model.time_bands, len(capture.moments)
     segments = _num_segments(config.model, num)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, segments=segments))
-    notes += describe_segments(segments, num)
+    notes += describe_segments(config, num)
     if segments > 1:
         num = _times_of_a_segment(segments, num)
     bands = determined_bands(config.model, num)
@@ -69,12 +69,17 @@ def make_plan(config: TrainConfig, capture: Capture) -> Planned:
     return Planned(Plan.of(config, choose_device(config.device), background, branches), notes, sky)
 
 
-def describe_segments(segments: int | None, num_times: int) -> list[str]:
-    """A sentence on the segments of a model, if it has several."""
-    if segments is None or segments == 1:
+def describe_segments(config: TrainConfig, num_times: int) -> list[str]:
+    """Sentences on the segments of a model, if it has several."""
+    model, most = config.model, config.densify.max_gaussians
+    if model.segments is None or model.segments == 1:
         return []
-    num = _times_of_a_segment(segments, num_times)
-    return [f"{segments} segments of about {num} times have dynamic Gaussians and a deformation of their own"]
+    num = _times_of_a_segment(model.segments, num_times)
+    notes = [f"{model.segments} segments of about {num} times have dynamic Gaussians and a deformation of their own"]
+    if (start := model.max_static_points + model.segments * model.dynamic_points) >= most:
+        limit = f"--densify.max-gaussians {most} counts those of all segments"
+        notes.append(f"warning: {limit} and leaves none to add to up to {start} initial Gaussians: give a larger one")
+    return notes
 
 
 def _times_of_a_segment(segments: int, num_times: int) -> int:

@@ -48,7 +48,7 @@ def prepare_start(config: TrainConfig, capture: Capture) -> Start:
 
 def prepare_again(plan: Plan, capture: Capture) -> Start:
     """What a run starts from that was begun with a plan, before its checkpoint is restored; as ``prepare_start``."""
-    notes = describe_segments(plan.model.segments, len(capture.moments))
+    notes = describe_segments(plan, len(capture.moments))
     sky = find_sky(capture.assuming(plan.assume)) if plan.background == "sky" else None
     return _with_remedies(_read(plan, capture, sky, resumed=True).noted(*notes))
 
