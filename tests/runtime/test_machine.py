@@ -6,7 +6,10 @@ import pytest
 import torch
 import warp as wp
 
+from tests.scenes import make_camera, make_splats
 from warpgs.kernels.adam import adam_step
+from warpgs.kernels.tiles import tile_ranges
+from warpgs.rendering import render
 from warpgs.runtime import kernel_cache, machine
 
 GPU = SimpleNamespace(is_cpu=False, get_cuda_compile_arch=lambda: 86)
@@ -28,10 +31,15 @@ def test_a_gpu_is_named_with_its_compute_capability(monkeypatch):
 
 def test_kernels_are_compiled_at_the_first_start_and_then_kept(cache):
     assert machine.kernels_note("cpu") == "kernels for it are compiled at the first start, which takes about a minute"
-    folder = cache / adam_step.module.get_module_identifier(1)
+    folder = cache / tile_ranges.module.get_module_identifier(1)
     folder.mkdir()
-    (folder / "adam.cpu12345678.o").touch()
+    (folder / "tiles.cpu12345678.o").touch()
     assert machine.kernels_note("cpu") == f"kernels for it are in {cache}"
+
+
+def test_an_image_on_a_cpu_leaves_the_kernels_that_are_looked_for():
+    render(make_splats(8).to("cpu"), make_camera().to("cpu"))
+    assert machine.kernels_note("cpu") == f"kernels for it are in {wp.config.kernel_cache_dir}"
 
 
 @pytest.mark.usefixtures("contracts_off")

@@ -5,6 +5,7 @@ import warp as wp
 
 from warpgs.config import Device
 from warpgs.kernels.adam import adam_step
+from warpgs.kernels.tiles import tile_ranges
 
 from . import kernel_cache
 from .launch import BLOCK_DIM
@@ -19,8 +20,12 @@ def described(device: Device) -> str:
 
 
 def kernels_note(device: Device) -> str:
-    """Whether kernels are compiled for a device: that of Adam is the last one of a training step."""
+    """Whether kernels are compiled for a device.
+
+    On CUDA that of Adam is the last one of a training step. On CPU Adam is torch's, and every image needs tiles.
+    """
     alias = "cpu" if device == "cpu" else f"cuda:{torch.cuda.current_device()}"
-    if kernel_cache.is_compiled(adam_step, wp.get_device(alias), BLOCK_DIM):
+    kernel = tile_ranges if device == "cpu" else adam_step
+    if kernel_cache.is_compiled(kernel, wp.get_device(alias), BLOCK_DIM):
         return f"kernels for it are in {wp.config.kernel_cache_dir}"
     return "kernels for it are compiled at the first start, which takes about a minute"
