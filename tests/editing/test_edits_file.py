@@ -229,7 +229,7 @@ def test_saved_edits_apply_to_exports_renders_and_the_viewer(run, capsys):
     assert main([*render, "--out", str(run.parent / "first"), "--max-gaussians", "9", "--save-edits"]) == 0
     assert f"edits keep 9 of {whole} Gaussians\nedits saved as {run / NAME}" in capsys.readouterr().out
     assert count(run) == 9
-    assert f"edits keep 9 of {whole} Gaussians" in capsys.readouterr().out
+    assert f"edits keep 9 of {whole} Gaussians, with those of {run / NAME}\n" in capsys.readouterr().out
     assert main([*render, "--out", str(run.parent / "second")]) == 0
     assert (run.parent / "second" / "00000.png").read_bytes() == (run.parent / "first" / "00000.png").read_bytes()
     source = open_source(run, "cpu", False)

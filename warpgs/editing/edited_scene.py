@@ -14,7 +14,7 @@ from warpgs.runs.trained import TrainedScene
 from warpgs.video.camera_paths import evenly_spaced
 
 from .contribution import Contribution, contribution, sample_cameras, weakest
-from .edits_file import check, edits_in_use, save_edits
+from .edits_file import NAME, check, edits_in_use, save_edits
 from .object_scene import ObjectScene, number_of, with_boxes, with_objects
 from .objects import Objects, find_objects, stored_objects
 from .options import Box, Editing, Edits, split_names
@@ -65,7 +65,8 @@ def with_edits(
     if edits != NOTHING:
         capture = open_capture() if edits.drop_floaters or edits.max_gaussians is not None else None
         scene = edited(scene, edits, capture, quiet)
-        notes.append(f"edits keep {_number(scene):,} of {before:,} Gaussians")
+        saved = f", with those of {folder / NAME}" if editing.edits is None and (folder / NAME).exists() else ""
+        notes.append(f"edits keep {_number(scene):,} of {before:,} Gaussians{saved}")
     if editing.save_edits:
         notes.append(f"edits saved as {save_edits(folder, editing, edits, original)}")
     return scene, notes
