@@ -369,6 +369,35 @@ def test_a_name_is_for_cameras_of_usd(tmp_path):
         read_cameras(tmp_path, made, "view 2")
 
 
+def test_colmap_cameras_that_were_turned_like_a_file_are_refused(tmp_path):
+    made = written(tmp_path, "colmap")
+    with pytest.raises(ValueError, match="has the capture's cameras, turned as in an exported file: export with --up"):
+        read_cameras(tmp_path, made)
+
+
+def test_colmap_cameras_elsewhere_have_the_times_of_frames_of_their_names(tmp_path):
+    made = capture()
+    views = list(made.cameras.values())
+    others = {name: dataclasses.replace(view, time=0.0) for name, view in zip(made.cameras, views[::-1], strict=True)}
+    write_cameras(tmp_path, "colmap", CameraSet.of(dataclasses.replace(made, cameras=others), np.eye(3), SECONDS))
+    read = read_cameras(tmp_path, made)
+    assert [camera.time for camera in read] == [view.time for view in views]
+    assert torch.allclose(read[0].viewmat, views[-1].viewmat, atol=1e-5)
+
+
+def test_how_colmap_cameras_are_filmed_is_said_only_where_they_were_turned(tmp_path):
+    hint = "render --cameras films them only if they are exported with --up scene"
+    assert hint in write_cameras(tmp_path / "a", "colmap", CameraSet.of(capture(), TURN, SECONDS))
+    assert hint not in write_cameras(tmp_path / "b", "colmap", CameraSet.of(capture(), np.eye(3), SECONDS))
+    assert hint not in write_cameras(tmp_path / "c", "nerfstudio", CameraSet.of(capture(), TURN, SECONDS))
+
+
+def test_a_folder_of_blender_says_which_files_it_has(tmp_path):
+    made = written(tmp_path, "blender")
+    with pytest.raises(ValueError, match=r"give one of its files, transforms_train.json, transforms_val.json"):
+        read_cameras(tmp_path, made)
+
+
 def test_colmap_cameras_that_are_no_frames_are_evenly_spaced_in_time(tmp_path):
     made = written(tmp_path, "colmap", rotation=np.eye(3))
     others = Capture("other", {"a": camera(0)}, ["a"], [], POINTS, None, lambda name: None)

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from warpgs.errors import counted
 
 from .camera_set import CameraSet
@@ -39,6 +41,8 @@ def write_cameras(folder: Path, name: str, cameras: CameraSet) -> str:
     form.write(folder, cameras)
     count = counted(len(cameras.cameras), "camera")
     lines = [f"{count} in {folder}, in the coordinates of the scene's file: {form.axes}"]
+    if name == "colmap" and not np.array_equal(cameras.rotation, np.eye(3)):
+        lines.append("render --cameras films them only if they are exported with --up scene")
     if cameras.is_distorted and not form.has_lens:
         lines.append(f"--cameras {name} holds pinholes: the distortion of the lens is not in it")
     if any(camera.motion is not None for camera in cameras.cameras.values()):
@@ -49,8 +53,7 @@ def write_cameras(folder: Path, name: str, cameras: CameraSet) -> str:
 CAMERA_FORMATS: dict[str, CameraFormat] = {
     "colmap": CameraFormat(
         write_colmap,
-        "world to camera, x right, y down, z forward; COLMAP has no times: ids follow them. "
-        "For render --cameras, export them with --up scene",
+        "world to camera, x right, y down, z forward; COLMAP has no times: ids follow them",
         True,
     ),
     "nerfstudio": CameraFormat(write_nerfstudio, "camera to world, x right, y up, z backward; times from 0 to 1", True),

@@ -27,6 +27,9 @@ from .usd_cameras import SUFFIXES, read_usd_cameras
 
 INDEX = "transforms.json"
 
+TURNED = 0.02
+"""Difference of rotations and, in scene units, of translations that corrections of poses stay below."""
+
 
 def read_cameras(path: Path, capture: Capture, name: str | None = None) -> list[Camera]:
     """The cameras of a file, with the size of the first one, in the order of their times, else of their names.
@@ -56,7 +59,8 @@ def read_cameras(path: Path, capture: Capture, name: str | None = None) -> list[
         named, times = _of_transforms(index)
     if len(named) > MAX_FRAMES:
         raise ValueError(f"{path} has {len(named):,} cameras, the maximum is {MAX_FRAMES:,}")
-    times = times or _times_of_frames(path, [name for name, _ in named], capture)
+    if times is None and (times := _times_of_frames(path, [name for name, _ in named], capture)):
+        _refuse_turned(path, named, capture)
     return _in_time([*zip(times or evenly_spaced(len(named)), (camera for _, camera in named), strict=True)])
 
 
@@ -95,13 +99,29 @@ Named = list[tuple[str, Camera]]
 """Cameras with the names of their images, at least one, in the order of these."""
 
 
+def _refuse_turned(path: Path, named: Named, capture: Capture) -> None:
+    """Raises ValueError if cameras are those of the capture in the coordinates of an exported scene.
+
+    A rotation of the world changes all rotations of world to camera by the same factor, and no translation.
+    """
+    own = torch.stack([capture.cameras[_frame_of(image, capture) or ""].viewmat.cpu() for image, _ in named])
+    given = torch.stack([camera.viewmat for _, camera in named])
+    turns = given[:, :3, :3].mT @ own[:, :3, :3]
+    is_turned = (turns[0] - torch.eye(3)).abs().max() > TURNED
+    alike = (turns - turns[0]).abs().max() < TURNED
+    if is_turned and alike and torch.allclose(given[:, :3, 3], own[:, :3, 3], rtol=TURNED, atol=TURNED):
+        raise ValueError(f"{path} has the capture's cameras, turned as in an exported file: export with --up scene")
+
+
 def _time(item: tuple[float, Camera]) -> float:
     return item[0]
 
 
 def _of_colmap(folder: Path) -> tuple[Named, None]:
     """The cameras of a model, which has no times."""
-    found = find_models(folder)
+    found, others = find_models(folder), sorted(path.name for path in folder.glob("transforms_*.json"))
+    if others and not found:
+        raise ValueError(f"{folder} has neither {INDEX} nor a COLMAP model: give one of its files, {few_of(others)}")
     model = load_model(found[0].folder if found else folder)
     images = sorted(model.images, key=lambda image: natural_order(image.name))
     if not images:
