@@ -37,7 +37,7 @@ def nest_config(run):
 
 def remove_checkpoints(run):
     shutil.rmtree(run / "checkpoints")
-    return f"{run} has no checkpoint yet\n"
+    return f"{run} has no checkpoint yet: warpgs train --resume {run} trains on\n"
 
 
 def truncate_checkpoint(run):

@@ -98,6 +98,11 @@ def test_what_has_no_part_of_a_capture_is_refused(root, folder, message):
     refused(root / folder, message)
 
 
+def test_a_folder_of_images_is_told_what_makes_a_capture_of_them(tmp_path):
+    (tmp_path / "a.JPG").write_bytes(b"")
+    refused(tmp_path, f"has images, but no cameras: warpgs prepare {tmp_path} CAPTURE --holdout 8 makes a capture")
+
+
 def test_a_misspelt_capture_is_told_the_name_that_is_similar(root):
     refused(root.with_name(root.name + "s"), rf"does not exist; did you mean {re.escape(str(root))}\?$")
 

@@ -204,6 +204,15 @@ def test_a_capture_is_not_a_run_folder_but_can_be_trained_on(data):
         read_config(data)
 
 
+def test_checkpoints_without_their_config_and_a_part_of_a_run_are_named(tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    with pytest.raises(ValueError, match=f"{tmp_path} is not a run folder: .* copy the whole run folder"):
+        read_config(tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ValueError, match=f"checkpoints is not a run folder: .* part of one: give {tmp_path}$"):
+        read_config(tmp_path / "checkpoints")
+
+
 def test_a_folder_with_files_is_not_trained_into(tmp_path, capture):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match=rf"{tmp_path} exists and is not empty: choose another --out"):

@@ -69,6 +69,19 @@ def _as_json(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else str(value)
 
 
+def _instead(folder: Path) -> str:
+    """What a folder without a config is, if that can be told, and what to do with it."""
+    from warpgs.data.loaders import is_capture  # imports torch
+
+    if is_capture(folder):
+        return f"; it is a capture: {command('train', '--data', folder)} trains on it"
+    if (folder / "checkpoints").is_dir():
+        return ", without which its checkpoints cannot be opened: copy the whole run folder"
+    if (folder.resolve().parent / NAME).is_file():
+        return f"; it is a part of one: give {folder.parent}"
+    return ""
+
+
 def read_config(folder: Path) -> Plan:
     """The plan of a run folder; if it does not name a device, it is that of ``choose_device``.
 
@@ -80,10 +93,7 @@ def read_config(folder: Path) -> Plan:
     if not folder.exists():
         raise ValueError(missing(folder))
     if not path.exists():
-        from warpgs.data.loaders import is_capture  # imports torch
-
-        capture = f"; it is a capture: {command('train', '--data', folder)} trains on it" * is_capture(folder)
-        raise ValueError(f"{folder} is not a run folder: it has no {NAME}{capture}")
+        raise ValueError(f"{folder} is not a run folder: it has no {NAME}{_instead(folder)}")
     written = read_json(path, max_bytes=MAX_BYTES)
     try:
         values = as_today(written)

@@ -166,15 +166,15 @@ class Run:
             ValueError: If there is no checkpoint, or it is damaged or does not fit the config.
         """
         saved = checkpoint.list_checkpoints(self.folder) if path is None else [path]
+        resume = command("train", "--resume", self.folder)
         if not saved:
-            raise ValueError(f"{self.folder} has no checkpoint yet")
+            raise ValueError(f"{self.folder} has no checkpoint yet: {resume} trains on")
         try:
             loaded = checkpoint.load(saved[-1])
             scene = checkpoint.load_scene(loaded, self.config.model, self.config.background == "sky")
         except checkpoint.DamagedCheckpointError as error:
             if len(saved) == 1:
                 raise
-            resume = command("train", "--resume", self.folder)
             advice = f"move it elsewhere to use {saved[-2].name}, or {resume} continues from the newest intact one"
             raise ValueError(f"{error}; {advice}") from error
         if limit_of_multiprocessors():  # which may break half precision; PSNR is the same to 0.001 dB

@@ -31,6 +31,7 @@ from .megasam import MegaSamLoader
 from .nerfds import NerfDsLoader, is_ambiguous
 from .nerfstudio import NerfstudioLoader
 from .options import LoadOptions
+from .skipped import IMAGE_SUFFIXES
 from .vipe import VipeLoader
 
 __all__ = [
@@ -153,6 +154,9 @@ def require_capture(root: Path) -> None:
             raise ValueError(f"{root} is a part of a capture: give {parent}")
     if find_models(root):
         raise ValueError(f"{root} has a COLMAP model, but not the folder images/ with its images")
+    if any(path.suffix.lower() in IMAGE_SUFFIXES for path in root.glob("*.*")):
+        made = command("prepare", root, "CAPTURE", "--holdout", "8")
+        raise ValueError(f"{root} has images, but no cameras: {made} makes a capture of them")
     raise ValueError(
         f"{root} has no dataset.json and the files of no other layout ({', '.join(LOADERS)}); warpgs prepare makes a "
         "capture of a video or a folder of frames"
