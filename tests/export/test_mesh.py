@@ -214,6 +214,15 @@ def test_one_branch_at_one_time_is_a_file_without_the_other(job, tmp_path, layer
     assert [node["name"] for node in document_of(tmp_path / "mesh.glb")["nodes"]] == names
 
 
+def test_voxels_in_which_what_moves_is_lost_are_refused_by_the_default_size(job, tmp_path, monkeypatch):
+    default = write_mesh(job(time=0.5)).partition("(static) and ")[2].partition(" scene units (dynamic)")[0]
+    (tmp_path / "mesh.glb").unlink()
+    monkeypatch.setattr(mesh._Maker, "dynamic", lambda self, times: [])
+    with pytest.raises(ValueError, match=f"whose voxels have {default} scene units by default: use a smaller one"):
+        write_mesh(job(time=0.5, voxel=0.05))
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -66,7 +66,10 @@ def write_mesh(job: Job) -> str:
             + ": use --format ply or glb, which hold the Gaussians themselves"
         )
     if times and not count and options.voxel:
-        raise ValueError(f"--voxel {options.voxel:g} is larger than what moves: use a smaller one, or --layers static")
+        raise ValueError(
+            f"--voxel {options.voxel:g} is too large for what moves, whose voxels have {maker.usual(times):.2g} scene "
+            "units by default: use a smaller one, or --layers static"
+        )
     summary = counted(0 if static is None else len(static.faces), "static triangle")
     if times:
         summary += f" and {count:,} dynamic ones at {counted(len(times), 'time')}"
@@ -156,16 +159,23 @@ class _Maker:
             self._view(self._scene.splats(camera.time), False, camera)
             for camera in progress(cameras, "static mesh", self._quiet)
         ]
-        voxel = self._fitting([views], MAX_DEFAULT)
+        voxel = self._fitting([views], MAX_DEFAULT, self._voxel)
         self._voxels.append(f"{voxel:.2g} scene units (static)")
         return self._mesh(views, voxel)
 
     def dynamic(self, times: Sequence[float]) -> list[Mesh]:
         """The meshes of the dynamic Gaussians at times."""
-        samples = [self._views_at(time) for time in evenly_spaced(times, 3)]
-        voxel = self._fitting(samples, max(MIN_DEFAULT, MAX_DEFAULT // len(times)))
+        voxel = self._dynamic_voxel(times, self._voxel)
         self._voxels.append(f"{voxel:.2g} scene units (dynamic)")
         return [self._mesh(self._views_at(time), voxel) for time in progress(times, "dynamic meshes", self._quiet)]
+
+    def usual(self, times: Sequence[float]) -> float:
+        """The size of the voxels of dynamic Gaussians at times, unless another one is asked for [scene units]."""
+        return self._dynamic_voxel(times, None)
+
+    def _dynamic_voxel(self, times: Sequence[float], voxel: float | None) -> float:
+        samples = [self._views_at(time) for time in evenly_spaced(times, 3)]
+        return self._fitting(samples, max(MIN_DEFAULT, MAX_DEFAULT // len(times)), voxel)
 
     def _views_at(self, time: float) -> list[DepthView]:
         """What cameras near in time, and some of all times, see of the dynamic Gaussians at a time."""
@@ -177,14 +187,14 @@ class _Maker:
     def _view(self, splats: Splats, is_dynamic: bool, camera: Camera) -> DepthView:
         return depth_view(splats, is_dynamic, camera, self._settings)
 
-    def _fitting(self, samples: Sequence[Sequence[DepthView]], max_default: int) -> float:
+    def _fitting(self, samples: Sequence[Sequence[DepthView]], max_default: int, voxel: float | None) -> float:
         """The size of voxels that is asked for, or at which all samples have few voxels [scene units].
 
         Samples in which nothing is seen say nothing about it, unless all are so.
         """
-        limit = max_default if self._voxel is None else MAX_VOXELS
+        limit = max_default if voxel is None else MAX_VOXELS
         seen = [views for views in samples if finest(views) is not None]
-        return max(fitting_blocks(views, limit, self._voxel)[0] for views in seen or samples)
+        return max(fitting_blocks(views, limit, voxel)[0] for views in seen or samples)
 
     def _mesh(self, views: Sequence[DepthView], voxel: float) -> Mesh:
         # Only a size that the user chose is refused, also at times between the samples.
