@@ -178,6 +178,17 @@ def test_ctrl_c_while_a_start_is_prepared_says_that_nothing_was_saved(config, mo
     assert not config.out.exists()
 
 
+def test_ctrl_c_while_a_run_is_opened_again_says_that_it_is_as_it_was(config, monkeypatch, capsys):
+    pressing_in_step(monkeypatch, number=5, presses=1)
+    with pytest.raises(TrainingInterrupted):
+        script.train(config)
+    monkeypatch.setattr(script, "prepare_again", lambda *_: press())
+    assert command.main(["--resume", str(config.out)]) == 130
+    assert capsys.readouterr().err.endswith(
+        ": stopped before the next iteration, the run is as it was: give the same command again\n"
+    )
+
+
 def test_ctrl_c_in_the_fit_of_what_moves_says_what_is_lost(config, monkeypatch, capsys):
     def start(*arguments):
         press()

@@ -42,6 +42,9 @@ Log = Callable[[str], None]
 BEFORE = "stopped before the first iteration, nothing was saved: give the same command again"
 """What Ctrl-C ends with while a training is prepared."""
 
+BEFORE_NEXT = "stopped before the next iteration, the run is as it was: give the same command again"
+"""What Ctrl-C ends with while a training that goes on is prepared."""
+
 FINISHED = "training is finished ({} iterations), and the run is evaluated again; a larger --iterations trains on"
 
 
@@ -208,7 +211,7 @@ def make_trainer(config: TrainConfig, log: Log | None = None, locks: contextlib.
         try:
             return make(config, log or ignore, log is None, until_made if locks is None else locks)
         except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(str(stop) or BEFORE) from None
+            raise KeyboardInterrupt(str(stop) or (BEFORE if config.resume is None else BEFORE_NEXT)) from None
 
 
 def _begun(config: TrainConfig, log: Log, quiet: bool, locks: contextlib.ExitStack) -> Trainer:
