@@ -3,10 +3,12 @@
 import json
 import subprocess
 import sys
+import zipfile
 
 import pytest
 import tyro
 
+from tests.data import layouts
 from tests.prepare import boards
 from warpgs.captures.command import run_check
 from warpgs.captures.options import Check
@@ -33,6 +35,20 @@ def test_an_unfit_capture_exits_with_code_1_and_prints_json_on_request(tmp_path,
         check(tmp_path, "--json")
     assert stop.value.code == 1
     assert json.loads(capsys.readouterr().out)["fit"] is False
+
+
+def test_json_is_all_that_is_printed_where_depth_is_damaged(tmp_path, capsys):
+    """OpenEXR prints what it cannot decode."""
+    root, path = layouts.write_vipe(tmp_path), tmp_path / "depth/clip.zip"
+    with zipfile.ZipFile(path) as archive:
+        files = {name: bytearray(archive.read(name)) for name in archive.namelist()}
+    files["00000.exr"][-100:-50] = bytes(50)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(name, bytes(data))
+    with pytest.raises(SystemExit):
+        check(root, "--json")
+    assert "damaged or truncated OpenEXR data" in str(json.loads(capsys.readouterr().out)["findings"])
 
 
 def test_an_unknown_dataset_is_reported_with_the_known_ones(root, capsys):

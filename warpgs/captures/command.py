@@ -1,6 +1,8 @@
 """The commands ``warpgs check`` and ``warpgs import``."""
 
+import contextlib
 import json
+import sys
 
 from warpgs.command_line.screen import show
 
@@ -15,7 +17,8 @@ def run_check(options: Check) -> None:
     Raises:
         SystemExit: With code 1 if the capture is not fit to train on.
     """
-    report = check_capture(options.capture, options.dataset, options.factor, options.assume)
+    with contextlib.redirect_stdout(sys.stderr):  # OpenEXR prints there what is damaged
+        report = check_capture(options.capture, options.dataset, options.factor, options.assume)
     if options.as_json:
         print(json.dumps(report.plain(), indent=2))
     else:
