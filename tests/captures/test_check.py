@@ -53,6 +53,8 @@ def test_a_single_training_frame_is_said_to_show_no_motion(root):
     capture = load_capture(root)
     warnings = [f.text for f in check_counts(capture.split(capture.train[:1], ())) if f.level == "warning"]
     assert warnings == ["1 training frame shows no motion: give frames of other moments"]
+    still = capture.split(capture.train[:1], ()).assuming("static")
+    assert [f.text for f in check_counts(still) if f.level == "warning"] == ["1 training frame is very few"]
 
 
 @pytest.mark.parametrize(("dataset", "masks", "depth"), [("nerfds", 6, 0), ("hypernerf", 0, 0), ("iphone", 0, 4)])

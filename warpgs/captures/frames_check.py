@@ -41,10 +41,11 @@ def check_counts(capture: Capture) -> Iterator[Finding]:
     if late:
         number = "1 evaluation frame lies" if len(late) == 1 else f"{len(late)} evaluation frames lie"
         yield Finding("warning", "time", f"{number} before or after all training frames")
-    if len(times) == 1:
+    if len(times) == 1 and capture.assumption != "static":
         yield Finding("warning", "counts", "1 training frame shows no motion: give frames of other moments")
     elif len(times) < 10:
-        yield Finding("warning", "counts", f"{len(times)} training frames are very few")
+        number = "1 training frame is" if len(times) == 1 else f"{len(times)} training frames are"
+        yield Finding("warning", "counts", f"{number} very few")
 
 
 def check_files(capture: Capture, contents: Mapping[str, Content]) -> Iterator[Finding]:
