@@ -1,5 +1,6 @@
 """Damaged or unsupported captures of other programs are refused in one line that names the file."""
 
+import io
 import json
 import os
 import shutil
@@ -179,8 +180,22 @@ def test_exr_depth_is_read_and_every_truncation_refused(compression, size):
     for end in range(0, len(data), max(1, len(data) // 40)):
         with pytest.raises(ValueError, match=r"^a\.exr: damaged or truncated OpenEXR data"):
             read_exr_channel(path, data[:end], "Z")
-    with pytest.raises(ValueError, match="no floating-point channel R"):
+    with pytest.raises(ValueError, match="no channel R among the OpenEXR channels Z"):
         read_exr_channel(path, data, "R")
+
+
+def test_an_exr_channel_of_whole_numbers_is_refused_by_name():
+    stream, numbers = io.BytesIO(), np.ones((4, 5), np.uint32)
+    OpenEXR.File({}, {"Z": numbers}).write(stream)
+    with pytest.raises(ValueError, match=r"^a\.exr: OpenEXR channel Z must hold a floating-point number for each pixel"):
+        read_exr_channel(Path("a.exr"), stream.getvalue(), "Z")
+
+
+def test_exr_depth_of_a_layer_in_a_window_that_begins_before_0_is_read_with_its_infinities():
+    stream, depth = io.BytesIO(), np.array([[np.inf, 2.0, 0.5]], np.float16)
+    window = np.array([-5, -7], np.int32), np.array([-3, -7], np.int32)
+    OpenEXR.File({"dataWindow": window, "displayWindow": window}, {"depth.Z": depth, "Z": depth + 1}).write(stream)
+    assert np.array_equal(read_exr_channel(Path("a.exr"), stream.getvalue(), "depth.Z"), depth.astype(np.float32))
 
 
 def test_deep_images_and_images_of_several_parts_are_refused(tmp_path):

@@ -57,9 +57,11 @@ def read_exr_channel(path: Path, data: bytes, channel: str, max_pixels: int = MA
     if width * height > max_pixels:
         raise ValueError(f"{path}: an OpenEXR image of {width}×{height} pixels, more than {max_pixels:,}")
     channels = _open(path, data, header_only=False).channels()
-    values = channels[channel].pixels if channel in channels else None
-    if values is None or values.dtype.kind != "f" or values.shape != (height, width):
-        raise ValueError(f"{path}: no floating-point channel {channel} among the channels {', '.join(channels)}")
+    if channel not in channels:
+        raise ValueError(f"{path}: no channel {channel} among the OpenEXR channels {', '.join(channels)}")
+    values = channels[channel].pixels
+    if values.dtype.kind != "f" or values.shape != (height, width):
+        raise ValueError(f"{path}: OpenEXR channel {channel} must hold a floating-point number for each pixel")
     return values.astype(np.float32)
 
 
