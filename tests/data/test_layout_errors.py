@@ -187,7 +187,9 @@ def test_exr_depth_is_read_and_every_truncation_refused(compression, size):
 def test_an_exr_channel_of_whole_numbers_is_refused_by_name():
     stream, numbers = io.BytesIO(), np.ones((4, 5), np.uint32)
     OpenEXR.File({}, {"Z": numbers}).write(stream)
-    with pytest.raises(ValueError, match=r"^a\.exr: OpenEXR channel Z must hold a floating-point number for each pixel"):
+    with pytest.raises(
+        ValueError, match=r"^a\.exr: OpenEXR channel Z must hold a floating-point number for each pixel"
+    ):
         read_exr_channel(Path("a.exr"), stream.getvalue(), "Z")
 
 

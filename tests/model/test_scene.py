@@ -127,7 +127,7 @@ def test_opacities_are_constant_where_the_network_changes_colours_alone():
 
 def test_the_appearance_network_gets_no_gradient_from_hidden_gaussians():
     scene, is_hidden = make_scene(appearance="all"), torch.arange(NUM_STATIC) < 3
-    splats = scene.splats(TIME, training=InTraining(is_hidden))
+    splats, _ = scene.splats_in_training(InTraining(is_hidden), TIME, True, True, None, None)
     assert not differing(static_part(splats), static_part(scene.splats(TIME)))
     weights = scene.appearance.trunk.values
     for changes in (splats.sh, splats.opacities):

@@ -24,7 +24,7 @@ CAMERA = along_z(400.0, (480, 270))
 def sample_paths(scene, time, interval, seed):
     """The [3, K, 3] paths of a step."""
     points = sampled_points(scene, time, interval, seed)
-    return scene.splats(time, training=InTraining(points=points)).others.view(3, -1, 3)
+    return scene.splats_in_training(InTraining(points=points), time, True, True, None, None)[1].view(3, -1, 3)
 
 
 def measured(paths, camera=CAMERA, num_static=0):
@@ -32,8 +32,8 @@ def measured(paths, camera=CAMERA, num_static=0):
     view = SimpleNamespace(
         camera=camera, image=torch.zeros(10, 10, 3), static_mask=torch.arange(100).view(10, 10) < num_static
     )
-    splats = SimpleNamespace(others=None if paths is None else paths.flatten(0, 1))
-    return acceleration(LossInputs(plain.loss(), view, splats, None, None, None, None))
+    points = None if paths is None else paths.flatten(0, 1)
+    return acceleration(LossInputs(plain.loss(), view, None, None, None, None, None, points))
 
 
 def accelerated(pixels, depth=2.0):
@@ -109,7 +109,7 @@ def test_without_dynamic_gaussians_the_term_is_0():
     time = torch.tensor([0.5])
     points = sampled_points(scene, time, 0.1, torch.tensor([7.0]))
     assert len(points.means) == 0
-    assert scene.splats(time, training=InTraining(points=points)).others is None
+    assert scene.splats_in_training(InTraining(points=points), time, True, True, None, None)[1] is None
     assert measured(None, make_camera()).item() == 0.0
 
 

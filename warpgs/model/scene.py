@@ -153,7 +153,6 @@ class SplitScene(nn.Module):
         use_appearance: bool = True,
         sh_degree: int | None = None,
         time_noise: Float[Tensor, " T"] | None = None,
-        training: InTraining | None = None,
     ) -> Splats:
         """The activated Gaussians at a time, static ones first.
 
@@ -164,11 +163,22 @@ class SplitScene(nn.Module):
             sh_degree: Maximum degree of spherical harmonics to use; all if None. Reflections need all.
             time_noise: Added to the time that the deformation network sees, one number or [D] of each dynamic Gaussian
                 (annealed smoothing of Deformable-3DGS, ``with_delays``).
-            training: What a training step asks for in addition.
         """
+        return self.splats_in_training(InTraining(), time, use_deformation, use_appearance, sh_degree, time_noise)[0]
+
+    def splats_in_training(
+        self,
+        training: InTraining,
+        time: Float[Tensor, "1"],
+        use_deformation: bool,
+        use_appearance: bool,
+        sh_degree: int | None,
+        time_noise: Float[Tensor, " T"] | None,
+    ) -> tuple[Splats, Float[Tensor, "M 3"] | None]:
+        """``splats``, and the positions of the points of ``training``, deformed; None without any or a deformation."""
         static, dynamic, device = self.static, self.dynamic, self.static.means.device
         residuals = logit_residuals = offsets = others = None
-        is_hidden, points, choice = training or InTraining()
+        is_hidden, points, choice = training
         with concurrently(device) as beside:
             with beside:
                 if use_appearance and len(static):
@@ -181,8 +191,8 @@ class SplitScene(nn.Module):
         geometry = activate(static.raw(), dynamic.raw(), static_changes, dynamic_changes)
         geometry = geometry._replace(opacities=self._faded(geometry.opacities, time, choice))
         is_dynamic = torch.arange(len(static) + len(dynamic), device=device) >= len(static)
-        splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree, others=others)
-        return self._reflecting(splats)
+        splats = Splats(**geometry._asdict(), sh=sh, is_dynamic=is_dynamic, sh_degree=sh_degree)
+        return self._reflecting(splats), others
 
     def _reflecting(self, splats: Splats) -> Splats:
         """The splats with what the dynamic ones reflect, once all degrees of spherical harmonics are in use."""

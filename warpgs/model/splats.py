@@ -32,7 +32,6 @@ class Splats:
         background: [3] colour behind them, or the sky, black if None; not used if ``colors`` have another number of
             channels, which are composited over 0.
         reflections: What the last Gaussians reflect, which is added to their colours by ``sh``; None if nothing.
-        others: [M, 3] positions of points that were deformed with them, and are not rendered; None without.
 
     Raises:
         ValueError: On a wrong shape, dtype or device, or unless exactly one of ``colors`` and ``sh`` is given.
@@ -49,7 +48,6 @@ class Splats:
     sh_degree: int | None = None
     background: Float[Tensor, "3"] | Dome | None = None
     reflections: Reflections | None = None
-    others: Float[Tensor, "M 3"] | None = None
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {}
@@ -69,12 +67,10 @@ class Splats:
             check_tensor("is_dynamic", self.is_dynamic, ("N",), sizes, (torch.bool,))
         if self.objects is not None:
             check_tensor("objects", self.objects, ("N",), sizes, (torch.int64,))
-        if self.others is not None:
-            check_tensor("others", self.others, ("M", 3), {})
         behind = self.background
         if behind is not None and not isinstance(behind, Dome):
             check_tensor("background", behind, (3,), {})
-        tensors = {name: getattr(self, name) for name in (*self.tensor_names(), "others")}
+        tensors = {name: getattr(self, name) for name in self.tensor_names()}
         check_same_device({**tensors, "background": behind.texels if isinstance(behind, Dome) else behind})
 
     @staticmethod
@@ -98,7 +94,7 @@ class Splats:
 
     def to(self, device: torch.device | str) -> "Splats":
         """A copy on another device."""
-        tensors = {n: t.to(device) for n in (*self.tensor_names(), "others") if (t := getattr(self, n)) is not None}
+        tensors = {n: t.to(device) for n in self.tensor_names() if (t := getattr(self, n)) is not None}
         reflections = None if self.reflections is None else self.reflections.to(device)
         behind = self.background
         behind = behind.moved_to(device) if isinstance(behind, Dome) else None if behind is None else behind.to(device)

@@ -78,7 +78,7 @@ def _instead(folder: Path) -> str:
     if (folder / "checkpoints").is_dir():
         return ", without which its checkpoints cannot be opened: copy the whole run folder"
     if (folder.resolve().parent / NAME).is_file():
-        return f"; it is a part of one: give {folder.parent}"
+        return f"; it is a part of one: give {folder.resolve().parent}"
     return ""
 
 

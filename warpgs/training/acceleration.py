@@ -48,15 +48,15 @@ def sampled_points(
 
 
 def acceleration(inputs: LossInputs) -> Float[Tensor, ""]:
-    """Acceleration of ``sampled_points``, deformed in ``Splats.others``, as the camera sees it [pixels per frame²].
+    """Acceleration of ``sampled_points``, deformed, as the camera sees it [pixels per frame²].
 
     Accelerations a well below one pixel count as a², larger ones as a: a² / √(a² + 1). Those behind the camera, where a
     pixel has no size, count as 0. The mean is multiplied by the fraction of the pixels that are dynamic, because the
     image terms pull at small objects as much less. Neither depth nor camera gets a gradient for making pixels larger.
     """
-    if inputs.splats.others is None:
+    if inputs.points is None:
         return inputs.view.image.new_zeros(())
-    (before, now, after), camera = inputs.splats.others.view(3, -1, 3), inputs.view.camera
+    (before, now, after), camera = inputs.points.view(3, -1, 3), inputs.view.camera
     with torch.no_grad():
         depth = camera.depths(now)
         pixels = torch.where(depth > 0.0, camera.focal / depth.clamp_min(MIN_DEPTH * depth.abs().max()), 0.0)

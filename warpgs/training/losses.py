@@ -28,6 +28,7 @@ class LossInputs(NamedTuple):
         backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
         alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.
         depth_trust: How much the view's depth is trusted. None like ``alignment``.
+        points: Positions of ``sampled_points``, deformed; None if there are none.
         unit: Length that counts as 1 (``TrainConfig.length_unit``) [scene units].
     """
 
@@ -38,6 +39,7 @@ class LossInputs(NamedTuple):
     backgrounds: Float[Tensor, "3 3"]
     alignment: Float[Tensor, "2"] | None
     depth_trust: DepthTrust | None
+    points: Float[Tensor, "M 3"] | None = None
     unit: float = 1.0
 
 

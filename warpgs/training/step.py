@@ -176,7 +176,9 @@ class Step:
         noise = self._inputs.time_noise
         if phase.use_deformation:
             noise = self.scene.with_delays(view.camera, view.time, noise)
-        splats = self.scene.splats(view.time, *flags, phase.sh_degree, noise, self._in_training(view, phase))
+        splats, points = self.scene.splats_in_training(
+            self._in_training(view, phase), view.time, *flags, phase.sh_degree, noise
+        )
         if phase.use_dropout:
             opacities = dropout(splats.opacities, self._inputs.dropout_seed, self.config.model.dropout)
             splats = replace(splats, opacities=opacities)
@@ -189,7 +191,7 @@ class Step:
         alignment, trust = self._depth_of_view() if phase.with_depth else (None, None)
         config = self.config.loss
         length = self.config.length_unit(self.unit)
-        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust, length)
+        inputs = LossInputs(config, view, splats, rendering, backgrounds, alignment, trust, points, length)
         terms = {name: TERMS[name].compute(inputs) for name in self._active(phase)}
         weights = torch.stack([self._inputs.scale[name] for name in terms])
         (torch.stack(list(terms.values())) * weights).sum().backward()
