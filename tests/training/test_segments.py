@@ -142,7 +142,7 @@ def test_a_limit_that_the_gaussians_of_all_segments_reach_at_the_start_is_told(d
     start = tiny.MODEL.max_static_points + 2 * tiny.MODEL.dynamic_points
     densify = dataclasses.replace(CONFIG.densify, max_gaussians=start + most)
     notes = make_plan(dataclasses.replace(CONFIG, densify=densify), capture).notes
-    message = f"warning: --densify.max-gaussians {start} counts those of all segments and leaves none to add to"
+    message = f"warning: up to {start} initial Gaussians may reach --densify.max-gaussians {start}, the limit of all"
     assert any(note.startswith(message) for note in notes) == warns
 
 

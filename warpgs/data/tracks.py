@@ -99,7 +99,7 @@ def make_tracks(
         raise ValueError(f"{path}: expected positions [N, F, 2] and visibility [N, F] of N points, got {shapes}")
     if positions.shape[1] != len(frames):
         counts = f"of {positions.shape[1]} frames, but the camera has {len(frames)}"
-        raise ValueError(f"{path}: tracks are {counts}: track all of these")
+        raise ValueError(f"{path}: tracks are {counts}: track exactly its frames")
     seen = visible > VISIBLE
     if not np.isfinite(positions[seen]).all():
         raise ValueError(f"{path}: positions of visible points must be finite numbers, or the points hidden there")

@@ -77,8 +77,8 @@ def describe_segments(config: TrainConfig, num_times: int) -> list[str]:
     num = _times_of_a_segment(model.segments, num_times)
     notes = [f"{model.segments} segments of about {num} times have dynamic Gaussians and a deformation of their own"]
     if (start := model.max_static_points + model.segments * model.dynamic_points) >= most:
-        limit = f"--densify.max-gaussians {most} counts those of all segments"
-        notes.append(f"warning: {limit} and leaves none to add to up to {start} initial Gaussians: give a larger one")
+        limit = f"--densify.max-gaussians {most}, the limit of all segments together"
+        notes.append(f"warning: up to {start} initial Gaussians may reach {limit}: give a larger one to add more")
     return notes
 
 
