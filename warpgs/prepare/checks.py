@@ -161,9 +161,9 @@ def check_frames(videos: Sequence[Frames], options: Options) -> None:
                 f"{video.width}×{video.height}: export the whole sphere from the camera's program"
             )
         count, whose = len(video.taken), f" of {video.source}" if len(videos) > 1 else ""
-        if count < needed_frames(options):
+        if count < (needed := needed_frames(options)):
             raise ValueError(
-                f"{count} frames{whose} are too few to find what moves, at least {MIN_FOR_MOTION} are needed: take "
+                f"{count} frames{whose} are too few to find what moves, at least {needed} are needed: take "
                 "more (--fps, --count), or give masks of what moves (--masks FOLDER, --masks none if nothing does)"
             )
         if k not in held_out_videos:

@@ -28,7 +28,8 @@ class LossInputs(NamedTuple):
         backgrounds: [3, 3] colours behind the joint, the static and the dynamic image.
         alignment: [2] scale and offset of the view's inverse depth; None unless ``Phase.with_depth``.
         depth_trust: How much the view's depth is trusted. None like ``alignment``.
-        points: Positions of ``sampled_points``, deformed; None if there are none.
+        points: [3 K, 3] positions of ``sampled_points``, deformed [scene units]; None unless
+            ``LossConfig.acceleration``, the deformation and dynamic Gaussians are in use.
         unit: Length that counts as 1 (``TrainConfig.length_unit``) [scene units].
     """
 
