@@ -298,3 +298,13 @@ def test_a_terminal_shows_the_bar_of_a_fit_instead_of_that_of_the_iterations(cap
     assert re.search(r"fitting what moves.* 25/100.*%.*0:01:30", during)
     assert "0/500" not in during.rpartition("fitting what moves")[2]
     assert "0/500" in after
+
+
+def test_the_bar_of_the_iterations_stays_while_nothing_is_fitted(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    with TrainingLogger(None, 500, 0) as log, log.fitting("fitting what moves"):
+        log._bar.refresh()
+        during = capsys.readouterr().out
+    assert "0/500" in during
+    assert "fitting what moves" not in during + capsys.readouterr().out

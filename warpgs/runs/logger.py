@@ -170,18 +170,20 @@ class TrainingLogger:
     def fitting(self, name: str) -> Iterator[Callable[[float], None]]:
         """Shows the progress of a fit between two iterations, whose time does not count in their speed.
 
-        Yields a function that takes the fraction of the fit that is done.
+        Yields a function that takes the fraction of the fit that is done. Nothing is shown before its first call,
+        because there may be nothing to fit.
         """
         start = self._last_line = time.monotonic()
-        task = None
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, visible=False)
-            task = self._bar.add_task(name, total=100, status="%", left=UNKNOWN)
+        task: TaskID | None = None
 
         def show(done: float) -> None:
+            nonlocal task
             now = time.monotonic()
             left = timedelta(seconds=round((now - start) * (1.0 - done) / done))
-            if self._bar is not None and task is not None:
+            if self._bar is not None and self._task is not None:
+                if task is None:
+                    self._bar.update(self._task, visible=False)
+                    task = self._bar.add_task(name, total=100, status="%", left=UNKNOWN)
                 self._bar.update(task, completed=round(100 * done), left=str(left))
             elif now - self._last_line > LINE_EVERY:
                 self._last_line = now
