@@ -24,8 +24,10 @@ def run(*arguments):
 
 def imported_by(program):
     """The heavy packages that a program imports."""
-    code = f"import sys\ntry:\n    {program}\nexcept SystemExit:\n    pass\nprint(*sys.modules, file=sys.stderr)"
-    return HEAVY & set(run("-c", code).stderr.split())
+    code = f"import sys\ntry:\n    {program}\nexcept SystemExit:\n    pass\nprint(*sys.modules)"
+    ended = run("-c", code)
+    assert ended.returncode == 0, ended.stderr
+    return HEAVY & set(ended.stdout.splitlines()[-1].split())
 
 
 def test_importing_the_package_imports_nothing_heavy():
@@ -81,6 +83,40 @@ def test_help_imports_nothing_heavy(command):
     assert imported_by(f"from warpgs.cli import main; main({arguments})") == set()
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "prepare nothing capture",
+        "prepare nothing --add masks",
+        "import nothing capture",
+        "check nothing",
+        "check builtin:studoi",
+        "check builtin:studio?depht=none",
+        "train --data nothing",
+        "train --data builtin:studoi",
+        "train --data builtin:studio?frames=161",
+        "train --resume nothing",
+        "train --iteratoins 5",
+        "sweep nothing",
+        "sweep nothing.toml",
+        "eval nothing",
+        "view nothing",
+        "view",
+        "render nothing",
+        "render --nothing",
+        "export nothing",
+        "report nothing",
+        "bench --scene nothing",
+        "bench --fps nothing",
+        "nothing",
+    ],
+)
+def test_wrong_names_and_options_are_refused_before_anything_heavy_is_imported(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(Path(warpgs.__file__).parents[1]))
+    assert imported_by(f"from warpgs.cli import main; assert main({command.split()}) == 2") == set()
+
+
 def test_train_is_a_command_and_a_script():
     script = Path(__file__).parents[1] / "train.py"
     by_command, by_script = run("-m", "warpgs", "train", "--help"), run(str(script), "--help")
@@ -116,6 +152,8 @@ def test_ctrl_c_that_a_package_swallows_while_it_is_imported_ends_with_one_line_
     # Background jobs and their children ignore SIGINT: restore the handler of a terminal.
     restore = "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
     (tmp_path / "sitecustomize.py").write_text(restore)
+    for folder in ("source", "capture", "run"):
+        (tmp_path / folder).mkdir()
     path = os.pathsep.join([str(tmp_path), str(Path(warpgs.__file__).parents[1])])
     program = [sys.executable, "-m", "warpgs", *command.split()]
     ended = subprocess.run(

@@ -16,7 +16,8 @@ class Command(NamedTuple):
     """A command.
 
     Attributes:
-        options: Its dataclass of options, as module:class. Its module imports nothing heavy, so that --help is fast.
+        options: Its dataclass of options, as module:class. Its module imports nothing heavy, so that --help is fast, as
+            is ``require_inputs``, a method that refuses inputs that do not exist.
         function: Does what the options ask for, as module:function; imported when the command line is right.
         summary: What it does, for the list of commands.
     """
@@ -31,6 +32,8 @@ class Command(NamedTuple):
 
     def run(self, options: Any) -> object:
         """Does what the options ask for; may return the exit code."""
+        if hasattr(options, "require_inputs"):
+            options.require_inputs()
         with ending_at_once():
             function = _imported(self.function)
         return function(options)

@@ -246,6 +246,13 @@ def missing(path: Path) -> str:
     return f"{path} does not exist{similar_path(path)}"
 
 
+def require_present(*paths: Path) -> None:
+    """Raises ValueError if a path does not exist; the message names a similar one that does."""
+    for path in paths:
+        if not path.exists():
+            raise ValueError(missing(path))
+
+
 def visible(text: str) -> str:
     """A text in which what a terminal would obey is escaped: names of files and fields come from others."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -5,7 +5,8 @@ import time
 
 import pytest
 
-from warpgs.sweep.spec import read_spec, shipped
+from warpgs.sweep.options import shipped
+from warpgs.sweep.spec import read_spec
 
 
 def write(folder, text):

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.errors import require_present
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -48,3 +50,7 @@ class Bench:
     """Preset whose networks and losses the training steps have."""
     fps: Path | None = None
     """Measure the frames per second of this run folder instead."""
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such trained scene."""
+        require_present(*self.scene, *([] if self.fps is None else [self.fps]))

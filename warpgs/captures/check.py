@@ -7,10 +7,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from warpgs.config.builtin import is_builtin
 from warpgs.data.capture import Assumption, Capture
 from warpgs.data.dynamic_regions import DynamicCounts
-from warpgs.data.loaders import missing_capture
 from warpgs.data.read_ahead import ReadAhead
 from warpgs.data.writer import REPORT
 from warpgs.files import read_json
@@ -20,6 +18,7 @@ from .check_sample import Content, Sample, read_contents
 from .depth_check import check_depth
 from .findings import Finding, Report, UnfitCaptureError
 from .frames_check import check_counts, check_files
+from .given import require_given
 from .masks_check import are_suspect, check_dynamic_depth, check_empty_masks, check_masks
 from .motion_check import Motion, check_motion, motions_of
 from .opening import load_capture
@@ -43,11 +42,10 @@ def check_capture(
         assume: What training will take as dynamic, as ``--assume`` says.
 
     Raises:
-        ValueError: If there is no such folder.
+        ValueError: If there is no such folder, or built-in capture.
     """
     deadline = time.monotonic() + READ_SECONDS
-    if not is_builtin(root) and not root.exists():
-        raise ValueError(missing_capture(root))
+    require_given(root)
     try:
         capture = load_capture(root, dataset, factor=factor, cache_frames=1).assuming(assume)
     except ValueError as error:

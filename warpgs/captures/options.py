@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from .given import require_given
+
 
 @dataclass(frozen=True)
 class Check:
@@ -22,6 +24,10 @@ class Check:
     """As in training: take what the masks say, or everything, as static or dynamic."""
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False
     """Print JSON."""
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such capture."""
+        require_given(self.capture)
 
 
 @dataclass(frozen=True)
@@ -43,3 +49,7 @@ class Import:
     """Keep all frames of these cameras for evaluation, and of the others those of --holdout or none."""
     quiet: bool = False
     """Print errors only."""
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such capture."""
+        require_given(self.source)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 
+from warpgs.config.builtin import NAMES, PREFIX
 from warpgs.errors import command, missing
 
 from .published import dataset_in, find_dataset, words
@@ -22,7 +23,7 @@ MAX_DEPTH = 3
 """How far below the last folder of the path that exists it is looked for."""
 
 
-def missing_folder(path: Path, is_capture: Callable[[Path], bool]) -> str:
+def missing_capture(path: Path, is_capture: Callable[[Path], bool]) -> str:
     """Message that a folder of a capture does not exist: similar ones, or where to get it and how to do without.
 
     Args:
@@ -30,6 +31,8 @@ def missing_folder(path: Path, is_capture: Callable[[Path], bool]) -> str:
         is_capture: Whether a folder looks like a capture.
     """
     text = missing(path)
+    if f"{PREFIX}{path}" in NAMES or str(path) == PREFIX.rstrip(":"):
+        return f"{text}; built-in captures are {', '.join(NAMES)}"
     if text == f"{path} does not exist" and (similar := similar_folders(path, is_capture)):
         text += f"; did you mean {' or '.join(map(str, similar))}?"
     if (dataset := dataset_in(path)) is None:

@@ -6,6 +6,7 @@ from typing import Literal
 
 from warpgs.command_line.parsing import RunFolder
 from warpgs.config import NetName
+from warpgs.errors import require_present
 
 
 @dataclass(frozen=True)
@@ -27,3 +28,7 @@ class Eval:
     """Device to render on; by default CUDA if there is a GPU."""
     quiet: bool = False
     """Hide progress."""
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such run."""
+        require_present(self.run_folder)

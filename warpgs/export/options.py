@@ -8,6 +8,7 @@ import tyro
 
 from warpgs.command_line.parsing import RunFolder
 from warpgs.editing.options import Editing
+from warpgs.errors import require_present
 
 
 @dataclass(frozen=True)
@@ -60,3 +61,7 @@ class Export:
     def is_out_file(self, suffix: str) -> bool:
         """Whether ``out`` is a file that ends with this suffix, not a folder."""
         return self.out is not None and self.out.suffix.lower() == suffix != "" and not self.out.is_dir()
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such run."""
+        require_present(self.run_folder)

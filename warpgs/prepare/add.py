@@ -22,8 +22,9 @@ from warpgs.data.capture import Capture
 from warpgs.data.depth_points import DepthView, points_of_views
 from warpgs.data.images import decode, is_bright, read_mask
 from warpgs.data.lens import Lens
-from warpgs.data.loaders import LOADERS, LoadOptions, missing_capture, recognize, require_finished
+from warpgs.data.loaders import LOADERS, LoadOptions, is_capture, recognize, require_finished
 from warpgs.data.loaders.nerfies import NerfiesLoader, find_depth, find_mask
+from warpgs.data.missing import missing_capture
 from warpgs.data.resized import resize_mask
 from warpgs.data.results.checked import checked
 from warpgs.data.results.depth import read_depths
@@ -67,7 +68,7 @@ def add_parts(root: Path, options: AddOptions, log: Callable[[str], None] | None
     """
     _check_options(options)
     if not root.exists():
-        raise ValueError(missing_capture(root))
+        raise ValueError(missing_capture(root, is_capture))
     require_finished(root)
     layout = recognize(root)
     loader = LOADERS[layout]

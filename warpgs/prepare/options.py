@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.errors import similar_path
+
 LensModel = Literal[
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 ]
@@ -133,6 +135,12 @@ class Prepare:
     """Replace an existing capture of prepare; other files are kept."""
     quiet: bool = False
     """Print errors only."""
+
+
+def require_source(source: Path) -> None:
+    """Raises ValueError if there is no such video or folder of images."""
+    if not source.exists():
+        raise ValueError(f"{source} is missing: expected a video or a folder of images{similar_path(source)}")
 
 
 def unread(value: str, methods: Container[str], files: str) -> str:

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from warpgs.errors import require_present
+
 
 @dataclass(frozen=True)
 class Report:
@@ -24,3 +26,7 @@ class Report:
     """Device to render on; CUDA by default if there is a GPU."""
     quiet: bool = False
     """Hide progress bars."""
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such run."""
+        require_present(*self.run_folders)

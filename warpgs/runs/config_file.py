@@ -11,7 +11,7 @@ from typing import Any
 
 from warpgs.config import Plan, TrainConfig, validate
 from warpgs.config.builtin import is_builtin
-from warpgs.errors import command, missing, suggestion
+from warpgs.errors import command, require_present, suggestion
 from warpgs.files import read_json, write_text
 
 from .former import FORMER, RENAMED, as_today, not_kept
@@ -90,8 +90,7 @@ def read_config(folder: Path) -> Plan:
             fields, or lacks a section or a field that every version writes.
     """
     path = folder / NAME
-    if not folder.exists():
-        raise ValueError(missing(folder))
+    require_present(folder)
     if not path.exists():
         raise ValueError(f"{folder} is not a run folder: it has no {NAME}{_instead(folder)}")
     written = read_json(path, max_bytes=MAX_BYTES)

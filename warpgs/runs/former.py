@@ -4,8 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from warpgs.runtime.devices import choose_device
-
 REMOVED_PRESETS = ("fast",)
 
 RENAMED = {"relight_from": "appearance_from", "undistort": "distortion"}
@@ -198,6 +196,8 @@ def _looked_up(values: dict[str, Any]) -> None:
     if values.get("background") == "capture":
         values["background"] = "black"
     if values.get("device") is None:
+        from warpgs.runtime.devices import choose_device  # imports torch, which advice on options does not need
+
         values["device"] = choose_device()
 
 

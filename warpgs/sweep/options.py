@@ -7,6 +7,29 @@ from typing import Annotated, Literal
 import tyro
 
 from warpgs.config import NetName
+from warpgs.errors import require_present, suggestion
+
+FOLDER = Path(__file__).parent / "sweeps"
+"""The sweeps that ship, as <name>.toml."""
+
+
+def shipped() -> list[str]:
+    """Names of the sweeps that ship."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+
+
+def file_of(name: str) -> Path:
+    """The file of a sweep that ships, by its name, or a TOML file.
+
+    Raises:
+        ValueError: If no sweep has this name.
+    """
+    if name.endswith(".toml"):
+        return Path(name)
+    if name not in shipped():
+        known = f"{', '.join(shipped())} or a .toml file"
+        raise ValueError(f"there is no sweep {name!r}, expected {known}{suggestion(name, shipped())}")
+    return FOLDER / f"{name}.toml"
 
 
 @dataclass(frozen=True)
@@ -50,3 +73,7 @@ class Sweep:
     """Train nothing; write the tables of what is finished."""
     dry_run: bool = False
     """Print the command of every training and end."""
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such sweep."""
+        require_present(file_of(self.sweep))

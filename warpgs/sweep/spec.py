@@ -29,8 +29,7 @@ from warpgs.errors import not_one_of, suggestion
 from warpgs.files import read_bounded
 from warpgs.parsed import parse_toml
 
-FOLDER = Path(__file__).parent / "sweeps"
-"""The sweeps that ship, as <name>.toml."""
+from .options import file_of
 
 MAX_BYTES = 1 << 20
 """Maximum size of a sweep's file [bytes]."""
@@ -88,21 +87,13 @@ class SweepSpec:
         return self.source.stem
 
 
-def shipped() -> list[str]:
-    """Names of the sweeps that ship."""
-    return sorted(path.stem for path in FOLDER.glob("*.toml"))
-
-
 def read_spec(name: str) -> SweepSpec:
     """A sweep that ships, by its name, or one from a TOML file.
 
     Raises:
         ValueError: If there is no such sweep, or its file is damaged or has unknown entries; the message names it.
     """
-    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
-    if not name.endswith(".toml") and name not in shipped():
-        known = f"{', '.join(shipped())} or a .toml file"
-        raise ValueError(f"there is no sweep {name!r}, expected {known}{suggestion(name, shipped())}")
+    path = file_of(name)
     return _parse(path, Path(name), parse_toml(path, read_bounded(path, MAX_BYTES)))
 
 

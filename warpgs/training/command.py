@@ -6,11 +6,12 @@ from collections.abc import Sequence
 import tyro
 
 from warpgs.captures.findings import UnfitCaptureError
+from warpgs.captures.given import require_given
 from warpgs.command_line.parsing import ALWAYS, flags, one_line_errors
 from warpgs.command_line.screen import show, show_error
 from warpgs.config import TrainConfig
 from warpgs.config.presets import PRESETS
-from warpgs.errors import ending_at_once, run_command, suggestion
+from warpgs.errors import ending_at_once, require_present, run_command, suggestion
 
 ADVICE = (
     "the run's last checkpoint is complete; start a new run with a smaller --densify.max-gaussians or a larger --factor"
@@ -80,6 +81,10 @@ def _former(name: str) -> str:
 
 def run(config: TrainConfig) -> int:
     """Trains, then evaluates, and prints what happens; returns the exit code."""
+    if config.resume is not None:
+        require_present(config.resume)
+    if config.data is not None:
+        require_given(config.data)
     with ending_at_once():
         from .train import train  # imports torch, which --help does not need
     try:

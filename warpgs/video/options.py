@@ -8,6 +8,7 @@ import tyro
 
 from warpgs.command_line.parsing import RunFolder, parse_size
 from warpgs.editing.options import Editing
+from warpgs.errors import require_present
 
 PathName = Literal["views", "fixed", "frozen", "moving", "spiral", "bullet"]
 
@@ -80,3 +81,7 @@ class Render:
         if self.cameras is not None:
             return "cameras"
         return "keyframes" if self.keyframes is not None else self.path or "views"
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such run."""
+        require_present(self.run_folder)

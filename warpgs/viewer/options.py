@@ -7,6 +7,7 @@ import tyro
 
 from warpgs.command_line.parsing import RunFolder
 from warpgs.editing.options import Editing
+from warpgs.errors import require_present
 
 
 @dataclass(frozen=True)
@@ -28,3 +29,8 @@ class View:
     editing: Annotated[Editing, tyro.conf.arg(name="")] = field(default_factory=Editing)
     device: Literal["cuda", "cpu"] | None = None
     """Device to render on; CUDA by default if there is a GPU."""
+
+    def require_inputs(self) -> None:
+        """Raises ValueError if there is no such run, unless a training is to make it."""
+        if not self.while_training:
+            require_present(self.run_folder)

@@ -8,17 +8,16 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from warpgs.config.builtin import NAMES, PREFIX
 from warpgs.data.camera_ids import with_camera_ids
 from warpgs.data.capture import Capture
 from warpgs.data.colmap_folders import find_models
 from warpgs.data.image_circle import with_image_circle
 from warpgs.data.masks import check_perturbation
-from warpgs.data.missing import missing_folder
+from warpgs.data.missing import missing_capture
 from warpgs.data.readout import with_readout
 from warpgs.data.tracks import read_tracks
 from warpgs.data.writer import FINISHED, STATE, WORK
-from warpgs.errors import command, missing, not_one_of
+from warpgs.errors import command, not_one_of
 from warpgs.files import read_json
 
 from .blender import BlenderLoader
@@ -88,7 +87,7 @@ def load_with(root: Path, dataset: str | None, options: LoadOptions) -> Capture:
         raise ValueError(f"factor must be at least 1, got {factor}")
     check_perturbation(options.perturbation)
     if dataset is not None and not root.exists():
-        raise ValueError(missing_capture(root))
+        raise ValueError(missing_capture(root, is_capture))
     require_finished(root)
     layout = dataset or _recognized(root)
     if layout is None:
@@ -128,19 +127,12 @@ def is_capture(root: Path) -> bool:
     return (root / "dataset.json").exists() or any(loader.recognizes(root) for loader in LOADERS.values())
 
 
-def missing_capture(root: Path) -> str:
-    """Message that a folder does not exist, and what was meant."""
-    if f"{PREFIX}{root}" in NAMES or str(root) == PREFIX.rstrip(":"):
-        return f"{missing(root)}; built-in captures are {', '.join(NAMES)}"
-    return missing_folder(root, is_capture)
-
-
 def require_capture(root: Path) -> None:
     """Raises ValueError if a path has no part of a capture; if it has some, the loader says what is missing."""
     if is_capture(root) or any((root / part).exists() for part in ("metadata.json", "scene.json", "camera", "rgb")):
         return
     if not root.exists():
-        raise ValueError(missing_capture(root))
+        raise ValueError(missing_capture(root, is_capture))
     if root.is_file():
         made = command("prepare", root, "CAPTURE", "--holdout", "8")
         raise ValueError(f"{root} is a file: give the folder of the capture; {made} makes one of a video")

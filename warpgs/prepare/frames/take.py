@@ -17,10 +17,10 @@ from warpgs.data.images import MAX_SIDE, decode
 from warpgs.data.loaders.name_times import times_of_names
 from warpgs.data.optical_flow import MAX_ASPECT, MIN_SIDE
 from warpgs.data.time_source import TimeSource
-from warpgs.errors import counted, similar_path
+from warpgs.errors import counted
 from warpgs.files import natural_order, read_json, write_json, write_png
 
-from ..options import MAX_FRAMES, MIN_FRAMES, Selection
+from ..options import MAX_FRAMES, MIN_FRAMES, Selection, require_source
 from .images import resize_to_side, sharpness
 from .offsets import Clock
 from .stillness import find_background
@@ -196,8 +196,7 @@ def take_frames(
         OSError: If a frame cannot be written.
     """
     check_selection(selection)
-    if not source.exists():
-        raise ValueError(f"{source} is missing: expected a video or a folder of images{similar_path(source)}")
+    require_source(source)
     notes = [] if notes is None else notes
     images = (
         read_folder(source, selection, quiet, notes) if source.is_dir() else read_video(source, selection, quiet, notes)
