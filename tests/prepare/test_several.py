@@ -13,7 +13,7 @@ from warpgs.captures.check import check_capture
 from warpgs.captures.opening import load_capture
 from warpgs.cli import main
 from warpgs.prepare import pipeline
-from warpgs.prepare.cameras.recovered import NoCamerasError
+from warpgs.prepare.cameras.recovered import NoCamerasError, require_cameras
 from warpgs.prepare.checks import find_videos
 from warpgs.prepare.options import Options, Selection
 
@@ -179,6 +179,11 @@ def test_a_camera_without_a_common_view_is_named(videos, tmp_path):
     options = Options(masks="none", offset="0,0.37,0", selection=Selection(count=6))
     with pytest.raises(NoCamerasError, match=r"other\.mp4 shares no view with .*a\.mp4 and .*b\.mp4: too"):
         pipeline.prepare([*videos[:2], other], tmp_path / "made", options)
+
+
+def test_cameras_of_videos_that_are_called_alike_are_counted_each_by_itself():
+    with pytest.raises(NoCamerasError, match=r"a\.mp4 shares no view with a\.mp4: too"):
+        require_cameras([6, 0], [6, 6], ["a.mp4", "a.mp4"])
 
 
 def test_a_video_without_texture_is_named(videos, tmp_path):

@@ -31,7 +31,7 @@ from .depth.estimate import add_depth, depth_files
 from .depth.methods import DEPTHS
 from .doubts import doubts_of_lens, doubts_of_masks, doubts_of_motion
 from .frames.images import read_images, resize_to_side
-from .frames.offsets import common_clock
+from .frames.offsets import common_clock, short_names
 from .frames.stillness import require_still
 from .frames.take import Frames, take_frames, take_videos
 from .journal import Journal
@@ -107,9 +107,9 @@ def _take(sources: Sequence[Path], folder: Path, options: Options, journal: Jour
     clock, starts = common_clock(sources, options.offsets, journal.quiet, needed_frames(options))
     videos = take_videos(sources, folder, options.selection, clock, journal.quiet, journal.notes)
     taken = [
-        f"{len(video.taken)} of {video.width}×{video.height} of {source.name} ({video.prefix}), "
+        f"{len(video.taken)} of {video.width}×{video.height} of {name} ({video.prefix}), "
         f"{'which stands still' if video.is_still else 'which moves'}"
-        for source, video in zip(sources, videos, strict=True)
+        for name, video in zip(short_names(sources), videos, strict=True)
     ]
     return videos, f"{'; '.join(taken)}; {starts}"
 

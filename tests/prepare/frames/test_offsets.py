@@ -167,6 +167,14 @@ def test_given_offsets_need_no_sound_and_only_their_differences_count(tmp_path):
     assert note.endswith("as given")
 
 
+def test_videos_of_one_name_in_several_folders_are_told_apart_by_their_paths(tmp_path):
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+    videos = [write(tmp_path / name, 0, seed=None) for name in ("left/a.mp4", "right/a.mp4", "b.mp4")]
+    note = common_clock(videos, [2.0, 0.5, 1.0])[1]
+    assert note == f"the videos start at {videos[0]} 1.500 s, {videos[1]} 0.000 s, b.mp4 0.500 s, as given"
+
+
 def test_given_offsets_larger_than_a_video_are_refused(tmp_path):
     videos = [write(tmp_path / "a.mp4", 0, seed=None), write(tmp_path / "b.mp4", 0, seed=None)]
     with pytest.raises(ValueError, match=r"b\.mp4 starts 7\.00 s after .*a\.mp4, which takes only 5\.88 s: they have"):

@@ -50,7 +50,7 @@ def require_cameras(counts: Sequence[int], of: Sequence[int], sources: Sequence[
         sources: Its video, for the message.
     """
     found = [source for count, source in zip(counts, sources, strict=True) if count]
-    if lost := [source for source in sources if source not in found]:
+    if lost := [source for count, source in zip(counts, sources, strict=True) if not count]:
         shares = "shares" if len(lost) == 1 else "share"
         raise NoCamerasError(
             f"{' and '.join(lost)} {shares} no view with {' and '.join(found) or 'each other'}: too little of what "

@@ -73,8 +73,14 @@ def common_clock(
     clock = Clock(starts, max(starts), min(ends))
     _require_together(sources, clock, [[float(t - own[0]) for t in own] for own in stamps], needed)
     where = "from their sound" if offsets is None else "as given"
-    listed = ", ".join(f"{source.name} {start:.3f} s" for source, start in zip(sources, starts, strict=True))
+    listed = ", ".join(f"{name} {start:.3f} s" for name, start in zip(short_names(sources), starts, strict=True))
     return clock, f"the videos start at {listed}, {where}"
+
+
+def short_names(sources: Sequence[Path]) -> list[str]:
+    """What messages call videos: their files' names, or their paths where several files have one name."""
+    names = [source.name for source in sources]
+    return [name if names.count(name) == 1 else str(source) for name, source in zip(names, sources, strict=True)]
 
 
 def _require_together(sources: Sequence[Path], clock: Clock, times: Sequence[Sequence[float]], needed: int) -> None:
@@ -128,7 +134,8 @@ def find_offsets(sources: Sequence[Path], first_frames: Sequence[Fraction], quie
     if len(starts) == 1:
         raise ValueError(f"the sounds of {' and '.join(map(str, sources))} do not tell when they start: {GIVE}")
     if lost := [source for k, source in enumerate(sources) if k not in starts]:
-        found_so_far = ", ".join(f"{sources[k].name} {start:.2f} s" for k, start in sorted(starts.items()))
+        names = short_names(sources)
+        found_so_far = ", ".join(f"{names[k]} {start:.2f} s" for k, start in sorted(starts.items()))
         raise ValueError(
             f"the sound of {lost[0]} does not tell when it starts (found: {found_so_far}): {GIVE}, or leave it out"
         )
