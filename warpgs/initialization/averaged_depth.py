@@ -18,6 +18,7 @@ from warpgs.views.views import View, Views
 
 from .depth_by_size import paint
 from .objects import MovingObject
+from .packed import packed_images
 from .point_cloud import filled
 from .seen_objects import SeenObject, Sizes, see_objects
 
@@ -48,16 +49,17 @@ def average_depths(
     aligned = alignments.isfinite().all(1).tolist()
     cameras = [capture.cameras[name] for name in capture.train]
 
-    def scaled_depth(index: int) -> Float[np.ndarray, "h w"]:
+    whole = [item for item in objects if not item.is_mostly_cut]
+
+    def known_depths(index: int) -> dict[MovingObject, float]:
         if aligned[index]:
             views.change_depth(index, without_rims)
-        return _scaled_depth(views[index], alignments[index], cameras[index])
+        depth = _scaled_depth(views[index], alignments[index], cameras[index]).flat
+        return {item: _mean_known(depth[item.pixels[index]]) for item in whole if index in item.pixels}
 
-    depths = list(views.in_threads(scaled_depth, range(len(views))))
-    images: dict[int, Tensor] = {}
-    whole = [item for item in objects if not item.is_mostly_cut]
+    depths, images = list(views.in_threads(known_depths, range(len(views)))), packed_images()
     for item, sizes in see_objects(capture, views, whole, SeenObject.sizes):
-        known = {index: _mean_known(depths[index].flat[pixels]) for index, pixels in item.pixels.items()}
+        known = {index: depths[index][item] for index in item.pixels}
         times = {index: cameras[index].time for index in known}
         corrections = _corrections(sizes, known, times, 1.0 - weight)
         paint(images, views, item, {k: filled(len(item.pixels[k]), 1.0 / value) for k, value in corrections.items()})

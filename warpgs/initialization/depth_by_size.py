@@ -1,7 +1,7 @@
 """Depth of dynamic objects by their size, in each frame that shows them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from warpgs.data.dynamic_regions import MIN_FRAMES, scaled_size
 from warpgs.views.views import Views
 
 from .objects import MovingObject
+from .packed import packed_images
 from .point_cloud import filled
 from .seen_objects import SeenObject, see_objects
 
@@ -20,7 +21,9 @@ SMOOTHING = 0.05
 """Standard deviation of the time, of all in [0, 1], over which the depth around an object is smoothed."""
 
 
-def depth_by_size(capture: Capture, views: Views, objects: Sequence[MovingObject]) -> dict[int, Float[Tensor, "h w"]]:
+def depth_by_size(
+    capture: Capture, views: Views, objects: Sequence[MovingObject]
+) -> Mapping[int, Float[Tensor, "h w"]]:
     """Depth of the objects in a capture's training frames, if it has some that keep their size.
 
     Args:
@@ -32,7 +35,7 @@ def depth_by_size(capture: Capture, views: Views, objects: Sequence[MovingObject
         By index of the frame, [h, w] depth in its scaled mask [scene units], NaN elsewhere: that of round objects, or,
         of objects that are hardly ever whole, of flat ones as far away as the static points around them.
     """
-    images: dict[int, Tensor] = {}
+    images = packed_images()
     whole, cut = ([item for item in objects if item.is_mostly_cut == is_cut] for is_cut in (False, True))
     for item, depths in see_objects(capture, views, whole, _depths):
         paint(images, views, item, depths)
@@ -43,7 +46,10 @@ def depth_by_size(capture: Capture, views: Views, objects: Sequence[MovingObject
 
 
 def paint(
-    images: dict[int, Tensor], views: Views, item: MovingObject, values: Mapping[int, Float[Tensor, " P"]]
+    images: MutableMapping[int, Float[Tensor, "h w"]],
+    views: Views,
+    item: MovingObject,
+    values: Mapping[int, Float[Tensor, " P"]],
 ) -> None:
     """Writes values of an object's pixels into images of the scaled masks, where these have none yet.
 
@@ -54,11 +60,12 @@ def paint(
         values: Values of its pixels by index of the frame.
     """
     for index, found in values.items():
-        if index not in images:
-            images[index] = torch.full(scaled_size(views.camera(index).size)[::-1], torch.nan, dtype=torch.float32)
-        image = images[index].view(-1)
-        pixels = torch.from_numpy(item.pixels[index]).long()
-        image[pixels] = torch.where(image[pixels].isnan(), found, image[pixels])
+        image = images.get(index)
+        if image is None:
+            image = torch.full(scaled_size(views.camera(index).size)[::-1], torch.nan, dtype=torch.float32)
+        flat, pixels = image.view(-1), torch.from_numpy(item.pixels[index]).long()
+        flat[pixels] = torch.where(flat[pixels].isnan(), found, flat[pixels])
+        images[index] = image
 
 
 def _depths(seen: SeenObject) -> dict[int, Float[Tensor, " P"]]:
@@ -67,26 +74,26 @@ def _depths(seen: SeenObject) -> dict[int, Float[Tensor, " P"]]:
     The measure of size is the one by which the object moves most evenly: the diameter of a ring stays the same while
     it tumbles, the area of a body while it deforms.
     """
-    choices, views = [], seen.views
-    for sizes, factor in seen.sizes():
-        if math.isnan(factor):
-            return {}
-        found = {index: factor / size for index, size in sizes.items()}
-        path = np.stack([views[index].position(found[index]) for index in seen.item.whole])
-        choices.append((float(np.linalg.norm(np.diff(path, 2, axis=0), axis=1).sum()), found))
-    _, depths = min(choices, key=lambda choice: choice[0])
-    return {index: views[index].surface(depth) for index, depth in depths.items()}
+    measured = seen.sizes()
+    if any(math.isnan(factor) for _, factor in measured):
+        return {}
+    choices = [{index: factor / size for index, size in sizes.items()} for sizes, factor in measured]
+    paths = np.stack([seen.positions(index, [found[index] for found in choices]) for index in seen.item.whole], 1)
+    bends = [float(np.linalg.norm(np.diff(path, 2, axis=0), axis=1).sum()) for path in paths]
+    _, depths = min(zip(bends, choices, strict=True), key=lambda choice: choice[0])
+    return {index: seen.view(index).surface(depth) for index, depth in depths.items()}
 
 
 def _depths_around(seen: SeenObject) -> dict[int, Float[Tensor, " P"]]:
     """Depth of the static points around an object, smoothed over time, at its pixels by frame; none if unknown."""
-    bounds = {index: seen.bound(index) for index in seen.views}
+    bounds = {index: seen.view(index).bound(seen.points_of(index)) for index in seen.item.pixels}
     known = [index for index, bound in bounds.items() if math.isfinite(bound)]
     if len(known) < MIN_FRAMES:
         return {}
-    times, logs = np.array([seen.views[index].time for index in known]), np.log([bounds[index] for index in known])
+    times = np.array([seen.camera_of(index).time for index in known])
+    logs = np.log([bounds[index] for index in known])
     found = {}
-    for index, view in seen.views.items():
-        weights = np.exp(-0.5 * ((times - view.time) / SMOOTHING) ** 2)
-        found[index] = filled(len(seen.item.pixels[index]), math.exp(np.average(logs, weights=weights)))
+    for index, pixels in seen.item.pixels.items():
+        weights = np.exp(-0.5 * ((times - seen.camera_of(index).time) / SMOOTHING) ** 2)
+        found[index] = filled(len(pixels), math.exp(np.average(logs, weights=weights)))
     return found

@@ -1,6 +1,6 @@
 """Dynamic objects as connected regions of the masks, followed from frame to frame."""
 
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -12,6 +12,8 @@ from warpgs.data.optical_flow import MIN_SIDE, even_contrast, flow_between
 from warpgs.runtime.launch import on_all_cores
 from warpgs.views.glance import Glance
 from warpgs.views.views import Views
+
+from .packed import packed_pixels
 
 MIN_OVERLAP = 0.3
 """Overlap of regions of consecutive frames, relative to the smaller one, from which on they show the same object."""
@@ -37,7 +39,7 @@ class MovingObject:
         is_mixture: Whether it is several objects that cannot be told apart.
     """
 
-    pixels: dict[int, Int[np.ndarray, " P"]] = field(default_factory=dict)
+    pixels: MutableMapping[int, Int[np.ndarray, " P"]] = field(default_factory=packed_pixels)
     whole: list[int] = field(default_factory=list)
     cut: list[int] = field(default_factory=list)
     is_mixture: bool = False

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import NamedTuple, TypeVar
 
 import cv2
@@ -54,9 +54,7 @@ def see_objects(
     told_apart = [item for item in objects if not item.is_mixture]
 
     def measured(k: int) -> Measured:
-        pixels_of = told_apart[k].pixels
-        seen_by = {index: ObjectView(pixels, views.camera(index)) for index, pixels in pixels_of.items()}
-        return measure(SeenObject(told_apart[k], seen_by, points_of))
+        return measure(SeenObject(told_apart[k], views.camera, points_of))
 
     yield from zip(told_apart, ReadAhead(measured).each(range(len(told_apart))), strict=True)
 
@@ -88,25 +86,38 @@ class SeenObject(NamedTuple):
 
     Attributes:
         item: The object.
-        views: How each frame sees it, by index of the frame.
+        camera_of: Given the index of a frame, its camera.
         points_of: Given the index of a frame, the static points that it shows.
     """
 
     item: MovingObject
-    views: dict[int, "ObjectView"]
+    camera_of: Callable[[int], Camera]
     points_of: Callable[[int], Points]
 
-    def bound(self, index: int) -> float:
-        """Depth of the static points around it in a frame; NaN if there are too few."""
-        return self.views[index].bound(self.points_of(index))
+    def view(self, index: int) -> "ObjectView":
+        """How a frame sees it; those of all frames of a long video together would take gigabytes."""
+        return ObjectView(self.item.pixels[index], self.camera_of(index))
+
+    def positions(self, index: int, depths: Sequence[float]) -> Float[np.ndarray, "D 3"]:
+        """Where its centre is at each of some depths, as a frame sees it, in scene units."""
+        view = self.view(index)
+        return np.stack([view.position(depth) for depth in depths])
 
     def sizes(self) -> list[Sizes]:
         """Its size by each measure."""
-        bounds = np.array([self.bound(index) for index in self.item.whole])
+        whole, cut = {*self.item.whole}, {*self.item.cut}
+        bound_of, measured = dict[int, float](), dict[int, tuple[float, float]]()
+        for index in self.item.pixels:
+            if index not in cut:
+                view = self.view(index)
+                measured[index] = view.diameter(), view.area()
+                if index in whole:
+                    bound_of[index] = view.bound(self.points_of(index))
+        bounds = np.array([bound_of[index] for index in self.item.whole])
         known = np.isfinite(bounds).any()
         found = []
-        for measure in (ObjectView.diameter, ObjectView.area):
-            sizes = {index: measure(view) for index, view in self.views.items() if index not in self.item.cut}
+        for k in range(2):
+            sizes = {index: both[k] for index, both in measured.items()}
             factors = bounds * [sizes[index] for index in self.item.whole]
             found.append(Sizes(sizes, float(np.nanquantile(factors, TIGHTEST)) if known else math.nan))
         return found
@@ -120,17 +131,22 @@ class ObjectView:
         camera: The camera of the frame.
 
     Attributes:
-        time: Time of the frame in [0, 1].
         size: (width, height) of the scaled mask.
     """
 
     def __init__(self, pixels: Int[np.ndarray, " P"], camera: Camera) -> None:
         self._camera = camera.resized(*scaled_size(camera.size))
-        self.time, self.size = camera.time, self._camera.size
+        self.size = self._camera.size
         rows, columns = np.divmod(pixels, self._camera.width)
         self._rows, self._columns = torch.from_numpy(rows).long(), torch.from_numpy(columns).long()
-        self._positions = torch.stack([self._columns, self._rows], 1) + 0.5
-        self._rays = self._camera.rays(self._positions).nan_to_num().numpy()
+
+    @cached_property
+    def _positions(self) -> Float[Tensor, "P 2"]:
+        return torch.stack([self._columns, self._rows], 1) + 0.5
+
+    @cached_property
+    def _rays(self) -> Float[np.ndarray, "P 3"]:
+        return self._camera.rays(self._positions).nan_to_num().numpy()
 
     def diameter(self) -> float:
         """Largest distance of two of its pixels at depth 1."""
