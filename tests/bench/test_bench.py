@@ -221,7 +221,7 @@ def tiny_workload(sh_degree=None):
         (["--json", "missing/report.json"], "no such folder"),
         (["--profile", "."], "it is a folder"),
         (["--sizes", "32x24"], "--sizes is for --scene and --fps"),
-        (["--scene", "missing.ply"], "--scene missing.ply: no such file or folder"),
+        (["--scene", "missing.ply"], "missing.ply does not exist"),
         (["--scene", ".", "--sizes", "32"], "--sizes must be WIDTHxHEIGHT"),
         (["--scene", ".", "--branches", "disc"], "--branches and --sh-degree are for random scenes"),
     ],

@@ -86,9 +86,7 @@ def check_scenes(options: Bench) -> None:
         raise ValueError("--sizes is for --scene and --fps")
     if options.scene and (options.branches != "none" or options.sh_degree is not None):
         raise ValueError("--branches and --sh-degree are for random scenes: omit --scene")
-    for path in options.scene:
-        if not path.exists():
-            raise ValueError(f"--scene {path}: no such file or folder")
+    options.require_inputs()
 
 
 def bench(options: Bench, scenes: Iterable[Views], device: str) -> list[Path]:
