@@ -179,6 +179,29 @@ def span_end(high: float, size: int) -> int:
 def exp2(x: float) -> float: ...
 
 
+def _add_columns(length: int, columns: int) -> str:
+    """C++ code that adds ``length`` values, each given as ``columns`` parts, to ``target[row]``.
+
+    A vector has the parts of one value first. Each step adds the upper half of the parts to the lower half, and joins
+    the halves of two neighbouring vectors: as many shuffles as vectors, instead of as many for each value.
+    """
+    code = f"""
+        typedef float V __attribute__((vector_size({4 * columns})));
+        float* total = &wp::index(target, row, 0);
+        V v[{length}];
+        __builtin_memcpy(v, &values, sizeof(v));
+        """
+    vectors, half = length, columns // 2
+    while half > 0:
+        lower = [i for i in range(2 * columns) if i // half % 2 == 0]
+        low, high = (", ".join(str(i + shift) for i in lower) for shift in (0, half))
+        for k in range(0, vectors, 2):
+            pair = f"v[{k}], v[{min(k + 1, vectors - 1)}]"
+            code += f"v[{k // 2}] = __builtin_shufflevector({pair}, {low}) + __builtin_shufflevector({pair}, {high});\n"
+        vectors, half = (vectors + 1) // 2, half // 2
+    return code + f"for (int k = 0; k < {length}; ++k) total[k] += v[k / {columns}][k % {columns}];"
+
+
 # Sums of K values over 32 lanes with little more than one shuffle per value instead of five: in each of the five steps
 # a lane sends the half of its values that its partner keeps, so that each lane ends with K/32 totals, which are
 # adjacent: the totals [index, index + held).
@@ -221,16 +244,7 @@ def make_lane_add(length: int, columns: int = 1):
             for (int k = 0; k < (K + 31) / 32; ++k)
                 if (k < held) atomicAdd(total + k, v[k]);
             """,
-            f"""
-            float* total = &wp::index(target, row, 0);
-            for (int k = 0; k < {length}; ++k) {{
-                float parts[{columns}];
-                for (int i = 0; i < {columns}; ++i) parts[i] = values[k * {columns} + i];
-                for (int n = {columns} / 2; n > 0; n /= 2)
-                    for (int i = 0; i < n; ++i) parts[i] += parts[n + i];
-                total[k] += parts[0];
-            }}
-            """,
+            _add_columns(length, columns),
         )
     )
     def lane_add(values: values_type, target: wp.array2d[float], row: int): ...
