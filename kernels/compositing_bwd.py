@@ -42,6 +42,7 @@ from .lanes import (
     stage_address,
     stage_get,
 )
+from .pixel_rows import make_read_gradient_row, make_read_row
 from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE_SUMS, NUM_MOMENTS, row_load
 from .tiles import DYNAMIC
 
@@ -93,6 +94,10 @@ def make_composite_bwd(
     vectorized = is_vectorized(pixels)
     num_sums = C + NUM_MOMENTS + (NUM_ABSOLUTE_SUMS if absgrad else 0)
     sums_vector, lane_add = make_lane_add(num_sums, columns if vectorized else 1)
+    float_row, read_floats = make_read_row(columns)
+    int_row, read_ints = make_read_row(columns, int)
+    _, read_gradients = make_read_gradient_row(columns)
+    _, read_color_gradients = make_read_gradient_row(columns * num_features)
 
     # No grid-stride loop of Warp; docs/design/lane-groups.md lists the kernels that are faster without it.
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique", module_options=module_options(P))
@@ -164,34 +169,85 @@ def make_composite_bwd(
         n = integers()
         v_color = colors()
         n_max = int(0)
-        for j in range(wp.static(rows_per_lane)):
-            for i in range(wp.static(columns)):
-                x = pixel_x + i * lane_columns()
-                y = pixel_y + j * lane_rows()
-                if x < width and y < height:
-                    k = j * wp.static(columns) + i
-                    pixel = y * width + x
-                    T[k] = transmittance[list_image * height * width + pixel]
-                    n[k] = last[list_image * height * width + pixel]
-                    n_max = wp.max(n_max, n[k])
-                    for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
-                        if (image_bits & (1 << m)) != 0:
-                            v_transmittance = -read_gradient(
-                                m, v_alpha_joint, v_alpha_static, v_alpha_dynamic, pixel, 1, 0
-                            )
-                            for c in range(wp.static(num_features)):
-                                v = read_gradient(
-                                    m, v_image_joint, v_image_static, v_image_dynamic, pixel, wp.static(num_features), c
+        if wp.static(vectorized):
+            inside = wp.min(wp.static(columns), width - pixel_x)
+            v_transmittances = float_row()
+            for j in range(wp.min(wp.static(rows_per_lane), height - pixel_y)):
+                row_begin = wp.static(columns) * j & wp.static(P - 1)
+                begin = (pixel_y + j) * width + pixel_x
+                t_row = read_floats(transmittance, list_image * height * width + begin, inside)
+                last_row = read_ints(last, list_image * height * width + begin, inside)
+                for i in range(wp.static(columns)):
+                    T[row_begin + i] = t_row[i]
+                    n[row_begin + i] = last_row[i]
+                for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
+                    if (image_bits & (1 << m)) != 0:
+                        v_alphas = read_gradients(m, v_alpha_joint, v_alpha_static, v_alpha_dynamic, begin, inside)
+                        for i in range(wp.static(columns)):
+                            v_transmittances[i] = -v_alphas[i]
+                        v_colors = read_color_gradients(
+                            m,
+                            v_image_joint,
+                            v_image_static,
+                            v_image_dynamic,
+                            begin * wp.static(num_features),
+                            inside * wp.static(num_features),
+                        )
+                        for c in range(wp.static(num_features)):
+                            for i in range(wp.static(columns)):
+                                v_color[c * wp.static(P) + row_begin + i] += v_colors[i * wp.static(num_features) + c]
+                            if background.shape[0] > 0:
+                                behind = background[m * background_stride + c]
+                                for i in range(wp.static(columns)):
+                                    v_transmittances[i] += behind * v_colors[i * wp.static(num_features) + c]
+                        if wp.static(with_depth):
+                            v_depths = read_gradients(m, v_depth_joint, v_depth_static, v_depth_dynamic, begin, inside)
+                            depths = read_floats(depth, m * height * width + begin, inside)
+                            for i in range(wp.static(columns)):
+                                v_depth_sum = v_depths[i] / wp.max(1.0 - t_row[i], MIN_ALPHA)
+                                v_color[wp.static(num_features * P) + row_begin + i] += v_depth_sum
+                                v_transmittances[i] += v_depth_sum * depths[i]
+                        for i in range(wp.static(columns)):
+                            R[row_begin + i] += t_row[i] * v_transmittances[i]
+            for k in range(wp.static(P)):
+                n_max = wp.max(n_max, n[k])
+        else:
+            for j in range(wp.static(rows_per_lane)):
+                for i in range(wp.static(columns)):
+                    x = pixel_x + i * lane_columns()
+                    y = pixel_y + j * lane_rows()
+                    if x < width and y < height:
+                        k = j * wp.static(columns) + i
+                        pixel = y * width + x
+                        T[k] = transmittance[list_image * height * width + pixel]
+                        n[k] = last[list_image * height * width + pixel]
+                        n_max = wp.max(n_max, n[k])
+                        for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
+                            if (image_bits & (1 << m)) != 0:
+                                v_transmittance = -read_gradient(
+                                    m, v_alpha_joint, v_alpha_static, v_alpha_dynamic, pixel, 1, 0
                                 )
-                                v_color[c * wp.static(P) + k] += v
-                                if background.shape[0] > 0:
-                                    v_transmittance += background[m * background_stride + c] * v
-                            if wp.static(with_depth):
-                                v_depth = read_gradient(m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0)
-                                v_depth_sum = v_depth / wp.max(1.0 - T[k], MIN_ALPHA)
-                                v_color[wp.static(num_features * P) + k] += v_depth_sum
-                                v_transmittance += v_depth_sum * depth[m * height * width + pixel]
-                            R[k] += T[k] * v_transmittance
+                                for c in range(wp.static(num_features)):
+                                    v = read_gradient(
+                                        m,
+                                        v_image_joint,
+                                        v_image_static,
+                                        v_image_dynamic,
+                                        pixel,
+                                        wp.static(num_features),
+                                        c,
+                                    )
+                                    v_color[c * wp.static(P) + k] += v
+                                    if background.shape[0] > 0:
+                                        v_transmittance += background[m * background_stride + c] * v
+                                if wp.static(with_depth):
+                                    v_depth = read_gradient(
+                                        m, v_depth_joint, v_depth_static, v_depth_dynamic, pixel, 1, 0
+                                    )
+                                    v_depth_sum = v_depth / wp.max(1.0 - T[k], MIN_ALPHA)
+                                    v_color[wp.static(num_features * P) + k] += v_depth_sum
+                                    v_transmittance += v_depth_sum * depth[m * height * width + pixel]
+                                R[k] += T[k] * v_transmittance
         n_max = lane_max(n_max)  # from here on, that of the lane group
 
         stage = stage_address()

@@ -55,6 +55,7 @@ from .lanes import (
     stage_address,
     stage_get,
 )
+from .pixel_rows import make_write_row
 from .rows import GEOMETRY_PARTS, row_load
 from .tiles import DYNAMIC
 
@@ -86,6 +87,9 @@ def make_composite_fwd(
     # With branches, the lowest two bits of a Gaussian's tag encode its branch, and those of a pixel's tag all branches
     # that it has evaluated; the other bits are the position in the list. (In lists of one branch they are not used.)
     branch_bits = 3 if images > 1 else 0
+    float_row, write_floats = make_write_row(columns)
+    int_row, write_ints = make_write_row(columns, int)
+    color_row, write_colors = make_write_row(columns * num_features, float, ndim=2)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=module_options(P))
     def composite_fwd(
@@ -170,7 +174,7 @@ def make_composite_fwd(
                 threshold = row1[1] - LOG2_ALPHA_MIN
                 half_size = ellipse_half_size(row0[2], row0[3], row1[0], threshold)
                 weight = float(0.0)
-                closed = int(0)
+                closed = int_row()
                 for j in range(
                     span_begin(row0[1] - half_size[1] - y0, wp.static(rows_per_lane)),
                     span_end(row0[1] + half_size[1] - y0, wp.static(rows_per_lane)),
@@ -197,7 +201,7 @@ def make_composite_fwd(
                             T[k] = wp.where(closes, -t, t_next)
                             seen = (tags | tag) & wp.static(branch_bits)
                             n[k] = wp.where(hit, seen | wp.where(closes, tags, tag), tags)
-                            closed += wp.where(closes, 1, 0)
+                            closed[i] += wp.where(closes, 1, 0)
                             if wp.static(statistics):
                                 weight += w
                     else:
@@ -231,7 +235,8 @@ def make_composite_fwd(
                                         n[k] = tag | (n[k] & wp.static(branch_bits))
                                         weight += w
                 if wp.static(vectorized):
-                    open_pixels[0] -= closed
+                    for i in range(wp.static(columns)):
+                        open_pixels[0] -= closed[i]
                 if wp.static(statistics) and own_image == 0:
                     weight = lane_sum(weight)
                     if lane == 0 and weight > 0.0:
@@ -248,27 +253,67 @@ def make_composite_fwd(
             own_state = 1 | 2 * lane_or(branches_seen)
             if own_image == 0 and lane == 0:
                 joint_state[block] = own_state
-        for j in range(wp.static(rows_per_lane)):
-            for i in range(wp.static(columns)):
-                x = pixel_x + i * lane_columns()
-                y = pixel_y + j * lane_rows()
-                if x < width and y < height:
-                    k = j * wp.static(columns) + i
-                    t = wp.abs(T[k])
-                    own_pixel = (own_image * height + y) * width + x
-                    transmittance[own_pixel] = t
-                    last[own_pixel] = n[k] / wp.static(branch_bits + 1)
-                    for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
-                        if m == own_image or equals_joint(m, own_state):
-                            p = (m * height + y) * width + x
-                            alpha_image[p] = 1.0 - t
-                            for c in range(wp.static(num_features)):
-                                value = color[c * wp.static(P) + k]
-                                if background.shape[0] > 0:
-                                    value += t * background[m * background_stride + c]
-                                image[p, c] = value
-                            if wp.static(num_features < C):
-                                found = color[wp.static(num_features * P) + k]
-                                depth[p] = found / wp.where(wp.static(num_sums < C), 1.0, wp.max(1.0 - t, MIN_ALPHA))
+        if wp.static(vectorized):
+            inside = wp.min(wp.static(columns), width - pixel_x)
+            t_row = float_row()
+            last_row = int_row()
+            alpha_row = float_row()
+            depth_row = float_row()
+            image_row = color_row()
+            for j in range(wp.min(wp.static(rows_per_lane), height - pixel_y)):
+                row_begin = wp.static(columns) * j & wp.static(P - 1)
+                for i in range(wp.static(columns)):
+                    t_row[i] = wp.abs(T[row_begin + i])
+                    last_row[i] = n[row_begin + i] / wp.static(branch_bits + 1)
+                    alpha_row[i] = 1.0 - t_row[i]
+                own_begin = (own_image * height + pixel_y + j) * width + pixel_x
+                write_floats(transmittance, own_begin, inside, t_row)
+                write_ints(last, own_begin, inside, last_row)
+                for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
+                    if m == own_image or equals_joint(m, own_state):
+                        begin = (m * height + pixel_y + j) * width + pixel_x
+                        write_floats(alpha_image, begin, inside, alpha_row)
+                        for c in range(wp.static(num_features)):
+                            for i in range(wp.static(columns)):
+                                image_row[i * wp.static(num_features) + c] = color[c * wp.static(P) + row_begin + i]
+                            if background.shape[0] > 0:
+                                behind = background[m * background_stride + c]
+                                for i in range(wp.static(columns)):
+                                    image_row[i * wp.static(num_features) + c] += t_row[i] * behind
+                        write_colors(
+                            image, begin * wp.static(num_features), inside * wp.static(num_features), image_row
+                        )
+                        if wp.static(num_features < C):
+                            for i in range(wp.static(columns)):
+                                found = color[wp.static(num_features * P) + row_begin + i]
+                                depth_row[i] = found / wp.where(
+                                    wp.static(num_sums < C), 1.0, wp.max(alpha_row[i], MIN_ALPHA)
+                                )
+                            write_floats(depth, begin, inside, depth_row)
+        else:
+            for j in range(wp.static(rows_per_lane)):
+                for i in range(wp.static(columns)):
+                    x = pixel_x + i * lane_columns()
+                    y = pixel_y + j * lane_rows()
+                    if x < width and y < height:
+                        k = j * wp.static(columns) + i
+                        t = wp.abs(T[k])
+                        own_pixel = (own_image * height + y) * width + x
+                        transmittance[own_pixel] = t
+                        last[own_pixel] = n[k] / wp.static(branch_bits + 1)
+                        for m in range(own_image, wp.where(own_image == 0, wp.static(images), own_image + 1)):
+                            if m == own_image or equals_joint(m, own_state):
+                                p = (m * height + y) * width + x
+                                alpha_image[p] = 1.0 - t
+                                for c in range(wp.static(num_features)):
+                                    value = color[c * wp.static(P) + k]
+                                    if background.shape[0] > 0:
+                                        value += t * background[m * background_stride + c]
+                                    image[p, c] = value
+                                if wp.static(num_features < C):
+                                    found = color[wp.static(num_features * P) + k]
+                                    depth[p] = found / wp.where(
+                                        wp.static(num_sums < C), 1.0, wp.max(1.0 - t, MIN_ALPHA)
+                                    )
 
     return composite_fwd
