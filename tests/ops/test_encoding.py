@@ -79,14 +79,27 @@ def test_the_encoding_starts_at_the_offset(half):
     assert torch.equal(with_offset[:, 16:], encode_unit_box(means, 4, 2, half=half))
 
 
+def run_kernel(like, means, raw, lanes_log2, half=False):
+    encoding = torch.zeros_like(like)
+    threads = len(like) * 4 << lanes_log2
+    launch(make_encode(half), threads, means, TIME, *BOX, 10, 3, 8, int(raw), lanes_log2, encoding)
+    return encoding[:, 8:]
+
+
 @RAW
 def test_several_threads_per_row_write_the_same_as_one(raw):
     means = random_means(5)
-    expected = encode_unit_box(means, 10, 3, offset=8, raw=raw)
-    encoding = torch.empty_like(expected)
-    threads = 5 * 4 << CUDA_LANES_LOG2
-    launch(make_encode(False), threads, means, TIME, *BOX, 10, 3, 8, int(raw), CUDA_LANES_LOG2, encoding)
-    assert torch.equal(encoding[:, 8:], expected[:, 8:])
+    like = torch.empty(5, 8 + encode_unit_box(means, 10, 3, raw=raw).shape[1])
+    assert torch.equal(run_kernel(like, means, raw, CUDA_LANES_LOG2), run_kernel(like, means, raw, 0))
+
+
+@RAW
+@pytest.mark.parametrize("half", [False, True])
+def test_the_kernel_of_cuda_equals_the_encoding_of_the_cpu(raw, half):
+    means = random_means(5)
+    encoding = encode_unit_box(means, 10, 3, offset=8, raw=raw, half=half)
+    difference = error(run_kernel(encoding, means, raw, CUDA_LANES_LOG2, half), encoding[:, 8:])
+    assert difference < (1e-3 if half else 2e-7)
 
 
 def test_without_bands_the_encoding_is_the_values():

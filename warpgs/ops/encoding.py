@@ -1,4 +1,6 @@
-"""Sinusoidal encoding of positions and time (kernels/encoding.py)."""
+"""Sinusoidal encoding of positions and time: on CUDA by kernels/encoding.py, on CPU by torch's vectorized sine."""
+
+import math
 
 import torch
 from jaxtyping import Float
@@ -43,18 +45,46 @@ def encode(
     Raises:
         ValueError: On a wrong shape, dtype or device.
     """
+    _check_inputs(means, time, box)
+    columns = aligned(encoded_size(*bands, raw))
+    rows = aligned(len(means), ROW_ALIGNMENT) if half else len(means)
+    encoding = means.new_empty(rows, offset + columns, dtype=torch.float16 if half else torch.float32)
+    if not means.is_cuda:
+        return _encode_on_cpu(means, time, bands, box, offset, raw, encoding)
+    arguments = (means, time, *box, *bands, offset, int(raw), kernels.CUDA_LANES_LOG2, encoding)
+    launch(kernels.make_encode(half), 4 * rows << kernels.CUDA_LANES_LOG2, *arguments)
+    return encoding
+
+
+def _check_inputs(means: Tensor, time: Tensor, box: tuple[Tensor, Tensor]) -> None:
     tensors = {"means": means, "time": time, "center": box[0], "half_size": box[1]}
     times = "N" if len(time) != 1 else 1
     sizes: dict[str, int] = {}
     for (name, tensor), shape in zip(tensors.items(), (("N", 3), (times,), (3,), (3,)), strict=True):
         check_tensor(name, tensor, shape, sizes)
     check_same_device(tensors)
-    columns = aligned(encoded_size(*bands, raw))
-    rows = aligned(len(means), ROW_ALIGNMENT) if half else len(means)
-    encoding = means.new_empty(rows, offset + columns, dtype=torch.float16 if half else torch.float32)
-    lanes_log2 = kernels.CUDA_LANES_LOG2 if means.is_cuda else 0
-    arguments = (means, time, *box, *bands, offset, int(raw), lanes_log2, encoding)
-    launch(kernels.make_encode(half), 4 * rows << lanes_log2, *arguments)
+
+
+@torch.no_grad()
+def _encode_on_cpu(
+    means: Tensor,
+    time: Tensor,
+    bands: tuple[int, int],
+    box: tuple[Tensor, Tensor],
+    offset: int,
+    raw: bool,
+    encoding: Tensor,
+) -> Tensor:
+    """The kernel's formulas; a call of sine in a kernel is one of the C library for each number."""
+    own, column = encoding[: len(means)], offset
+    for values, number in (((means - box[0]) / box[1], bands[0]), (time[:, None], bands[1])):
+        scaled = values[..., None] * torch.tensor([2.0**k for k in range(number)], dtype=torch.float32)
+        angles = (math.pi * (scaled - 2.0 * torch.round(0.5 * scaled))).flatten(1)
+        for part in ([values] if raw else []) + [angles.sin(), angles.cos()]:
+            own[:, column : column + part.shape[1]] = part
+            column += part.shape[1]
+    own[:, column:] = 0.0
+    encoding[len(means) :] = own[-1:]
     return encoding
 
 
