@@ -11,7 +11,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import torch
@@ -98,24 +98,31 @@ def launch_on_cpu(
     chunk = max(1, -(-dim // (shards * CHUNKS_PER_SHARD))) if shards > 1 else dim
 
     def run_shard(shard: int) -> None:
-        command = command_for(kernel, CPU, 1)
         own = (*arguments, *(None if t is None else t[shard] for t in per_shard))
-        for first in range(shard * chunk, dim, shards * chunk):
-            command(min(chunk, dim - first), first, own, None)
+        command_for(kernel, CPU, 1).run_chunks(range(shard * chunk, dim, shards * chunk), chunk, dim, own)
 
     on_all_cores(run_shard, shards)
 
 
 def on_all_cores(function: Callable[[int], None], number: int) -> None:
-    """Calls ``function(0)`` to ``function(number - 1)`` at once, on the threads of the CPU shards, and waits for them.
+    """Calls ``function(0)`` to ``function(number - 1)`` at once, on this thread and those of the CPU shards, and waits.
 
-    It helps those functions that release Python's global interpreter lock.
+    It helps those functions that release Python's global interpreter lock. This thread takes part, because a system
+    may wake two threads on the core of the one that then waits for them.
     """
-    if number == 1 or _num_cores() == 1:
-        for index in range(number):
+    indices = iter(range(number))
+
+    def work() -> None:
+        for index in indices:
             function(index)
-    else:
-        list(_workers().map(function, range(number)))
+
+    others = [_workers().submit(work) for _ in range(min(number, _num_cores()) - 1)]
+    try:
+        work()
+    finally:
+        wait(others)
+    for other in others:
+        other.result()
 
 
 @functools.cache
@@ -165,14 +172,37 @@ class Command:
         for k in arrays:
             self.pointers[k] = (k * size + array_type.data.offset) // 8
             self.launch.set_param_at_index_from_ctype(k + 1, array_type.from_buffer(memory, k * size))
+        fields = [(a.label, type(p)) for a, p in zip(kernel.adj.args, self.launch.params[1:], strict=True)]
+        self.packed = type("Packed", (ctypes.Structure,), {"_fields_": fields})
 
     def __call__(self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None) -> None:
         """Launches threads ``first`` to ``first + dim - 1``, with tensors, numbers, tuples or None."""
+        self._set_dim(dim)
+        if first != self.first:
+            self.first = self.launch.params[1].value = first
+        self._write(arguments)
+        self.launch.launch(stream)
+
+    def run_chunks(self, firsts: range, chunk: int, end: int, arguments: Sequence[Any]) -> None:
+        """Runs ``chunk`` threads from each of ``firsts`` on, up to the thread ``end``, on this core of the CPU.
+
+        A launch of Warp packs the arguments again, with Python's global interpreter lock, for which the other cores
+        would wait.
+        """
+        self._write(arguments)
+        packed = self.packed(*self.launch.params[1:])
+        for first in firsts:
+            self._set_dim(min(chunk, end - first))
+            packed.first = first
+            self.launch.hooks.forward(ctypes.byref(self.launch.bounds), ctypes.byref(packed))
+
+    def _set_dim(self, dim: int) -> None:
         if dim != self.dim:
             self.launch.set_dim(dim)
             self.dim = dim
-        if first != self.first:
-            self.first = self.launch.params[1].value = first
+
+    def _write(self, arguments: Sequence[Any]) -> None:
+        """Writes addresses, and what else differs from the last launch."""
         words, is_known = self.words, len(arguments) == len(self.known)
         for value, known, pointer in zip(arguments, self.known, self.pointers):  # noqa: B905 - strict takes longer
             if pointer is None or value is None:
@@ -182,7 +212,6 @@ class Command:
                 is_known = is_known and value.shape == known
         if not is_known:
             self._describe(arguments)
-        self.launch.launch(stream)
 
     def _describe(self, arguments: Sequence[Any]) -> None:
         """Writes all numbers and the shapes of all tensors."""
