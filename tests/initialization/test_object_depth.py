@@ -296,8 +296,12 @@ def test_cameras_are_followed_on_all_cores_with_the_results_of_one(monkeypatch):
     views, threads = views_of(capture.with_cameras(cameras), resident_bytes=0), set()
     expected = [item for video in views.videos for order in (video, video[::-1]) for item in find_objects(views, order)]
 
+    together = threading.Barrier(2)
+
     def find(views, order):
-        threads.add(threading.get_ident())
+        if threading.get_ident() not in threads:
+            threads.add(threading.get_ident())
+            together.wait(timeout=60)  # for the other core
         return find_objects(views, order)
 
     monkeypatch.setattr(objects, "find_objects", find)
@@ -309,7 +313,7 @@ def test_cameras_are_followed_on_all_cores_with_the_results_of_one(monkeypatch):
         assert (item.whole, item.cut, item.is_mixture) == (other.whole, other.cut, other.is_mixture)
         assert item.pixels.keys() == other.pixels.keys()
         assert all(np.array_equal(item.pixels[k], other.pixels[k]) for k in item.pixels)
-    assert threading.get_ident() not in threads
+    assert len(threads) == 2
 
 
 def test_objects_that_part_are_told_apart_backward_in_time():

@@ -1,5 +1,7 @@
 """Launches: checks of arguments, shards, profiles."""
 
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -163,3 +165,32 @@ def test_nothing_is_listed_after_the_end_of_a_profile():
 def test_two_profiles_at_once_are_refused():
     with profile(), pytest.raises(RuntimeError, match="another profile is active"), profile():
         pass
+
+
+@pytest.mark.parametrize("failing", [0, 4])
+def test_a_failure_on_one_core_is_raised_once_all_others_have_ended(monkeypatch, failing):
+    monkeypatch.setattr(launching, "_num_cores", lambda: 3)
+    ended = []
+
+    def work(index):
+        if index == failing:
+            raise ValueError(f"index {index}")
+        time.sleep(0.02)
+        ended.append(index)
+
+    with pytest.raises(ValueError, match=f"index {failing}"):
+        launching.on_all_cores(work, 5)
+    assert sorted(ended) == sorted({*range(5)} - {failing})
+
+
+def test_the_calling_thread_works_too(monkeypatch):
+    monkeypatch.setattr(launching, "_num_cores", lambda: 2)
+    together, threads = threading.Barrier(2), set()
+
+    def work(index):
+        threads.add(threading.get_ident())
+        together.wait(timeout=60)
+
+    launching.on_all_cores(work, 2)
+    assert len(threads) == 2
+    assert threading.get_ident() in threads

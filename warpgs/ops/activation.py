@@ -131,11 +131,11 @@ def _join_sh(bases: int, *tensors: Any) -> Recorded:
         if sh.is_cuda:
             launch(kernels.join_sh_fwd, len(parts[0]) * bases, *parts, first_row, sh)
         else:
-            _copy_sh(*parts, sh[first_row : first_row + len(parts[0])])
+            _copy_sh(sh[first_row : first_row + len(parts[0])], *parts)
     return Recorded((sh,), _join_sh_backward, tensors)
 
 
-def _copy_sh(sh_dc: Tensor, sh_rest: Tensor, residuals: Tensor | None, sh: Tensor) -> None:
+def _copy_sh(sh: Tensor, sh_dc: Tensor, sh_rest: Tensor, residuals: Tensor | None) -> None:
     """``join_sh_fwd`` on CPU, where torch copies whole rows, a tenth of the time of a thread per coefficient."""
     sh[:, :1] = sh_dc
     sh[:, 1:] = sh_rest
