@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
@@ -194,7 +195,7 @@ def defines_kernels(path: Path) -> bool:
 
 
 KERNEL_FILES = [p for p in (ROOT / "kernels").glob("*.py") if defines_kernels(p)]
-OPS = sorted({p.stem.removesuffix("_fwd").removesuffix("_bwd") for p in KERNEL_FILES})
+OPS = sorted({re.sub("_(fwd|bwd|cpu)$", "", p.stem) for p in KERNEL_FILES})
 
 
 def test_there_are_kernels():

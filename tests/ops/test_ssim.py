@@ -7,22 +7,23 @@ from skimage.metrics import structural_similarity
 from tests.reference.ssim import ssim_map as reference
 from tests.scenes import assert_same_gradients, error, generator, relative_error
 from warpgs.kernels import ssim as kernels
+from warpgs.kernels.ssim_cpu import MAX_CHANNELS
 from warpgs.ops import ssim_cpu
 from warpgs.ops.ssim import l1_and_ssim, ssim, ssim_map
 
-SIZES = [(1, 1, 1), (37, 50, 3), (70, 9, 2), (12, 13, ssim_cpu.MAX_CHANNELS + 1)]
-"""Also higher than one thread's strip, narrower than the window, and with more channels than OpenCV filters."""
+SIZES = [(1, 1, 1), (37, 50, 3), (70, 9, 2), (130, 67, 3), (12, 13, MAX_CHANNELS + 1)]
+"""Also larger than a thread's block, narrower than the window, and of more channels than the CPU's kernels take."""
 
 
 def run_kernels(monkeypatch):
     """Lets the CPU run the kernels of CUDA."""
-    monkeypatch.setattr(ssim_cpu, "can_filter", lambda image: False)
+    monkeypatch.setattr(ssim_cpu, "has_kernel", lambda image: False)
 
 
-@pytest.fixture(autouse=True, params=["filters", "kernels"])
+@pytest.fixture(autouse=True, params=["cpu", "cuda"])
 def implementation(request, monkeypatch):
-    """Each test runs OpenCV's filters, the implementation of the CPU, and the kernels of CUDA."""
-    if request.param == "kernels":
+    """Each test runs the kernels of the CPU and those of CUDA."""
+    if request.param == "cuda":
         run_kernels(monkeypatch)
 
 

@@ -1,6 +1,6 @@
 """Structural similarity (SSIM), alone or together with the L1 loss.
 
-On CUDA by two kernels (kernels/ssim.py, where the formulas are), on CPU by OpenCV's filters (ops/ssim_cpu.py).
+On CUDA by two kernels (kernels/ssim.py, where the formulas are), on CPU by those of kernels/ssim_cpu.py.
 """
 
 from typing import Any, NamedTuple
@@ -73,8 +73,8 @@ def _compare(image: Tensor, target: Tensor, mask: Tensor | None, weights: Weight
     """base + l1 |image − target| + similarity SSIM: the mean, or without L1 the [H, W, C] values."""
     assert mean or weights == SIMILARITY
     _check_inputs(image, target, mask, mean)
-    filtered = ssim_cpu.can_filter(image)
-    forward, backward = (ssim_cpu.ssim_fwd, ssim_cpu.ssim_bwd) if filtered else (ssim_fwd, ssim_bwd)
+    on_cpu = ssim_cpu.has_kernel(image)
+    forward, backward = (ssim_cpu.ssim_fwd, ssim_cpu.ssim_bwd) if on_cpu else (ssim_fwd, ssim_bwd)
 
     def op(image: Tensor, target: Tensor) -> Recorded:
         values, partials = forward(image, target, mask, weights, image.requires_grad)
