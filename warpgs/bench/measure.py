@@ -39,7 +39,7 @@ STAGES = {
     "composite_fwd": ("composite_fwd",),
     "composite_bwd": ("composite_bwd",),
     "project_bwd": ("project_bwd", "sh_bwd"),
-    "ssim": ("ssim_fwd", "ssim_bwd"),
+    "ssim": ("ssim_fwd", "ssim_bwd", "ssim_cpu_fwd", "ssim_cpu_bwd"),
 }
 """Kernels of each stage of a render."""
 
