@@ -246,7 +246,9 @@ def test_every_image_equals_that_of_its_splats_rendered_alone(make, seed, monkey
             if not backwards or kernel.func.__name__ != "composite_fwd":
                 return launch_on_cpu(kernel, dim, arguments, per_shard, work)
             for thread in reversed(range(dim)):
-                command_for(kernel, launch.CPU, 1)(1, thread, (*arguments, *per_shard), None)
+                command_for(kernel, launch.CPU, 1).run_chunks(
+                    range(thread, thread + 1), 1, thread + 1, (*arguments, *per_shard)
+                )
 
         monkeypatch.setattr(launch, "launch_on_cpu", run_kernel)
         result = ours(inputs, size, is_dynamic=dynamic)

@@ -85,7 +85,7 @@ def launch(
     if index == CPU:
         launch_on_cpu(kernel, dim, arguments, per_shard, work)
     else:
-        command_for(kernel, index, block_dim)(dim, 0, arguments + per_shard, current_stream(index))
+        command_for(kernel, index, block_dim)(dim, arguments + per_shard, current_stream(index))
     if begun is not None:
         profiling.end(kernel.func.__name__, begun, arguments[0])
 
@@ -160,7 +160,7 @@ class Command:
         kernel_cache.load(kernel, device, block_dim)
         blank = [_blank(a.type) for a in kernel.adj.args]
         self.launch = wp.launch(kernel, dim=1, inputs=blank, device=device, block_dim=block_dim, record_cmd=True)
-        self.dim, self.first = 1, 0
+        self.dim = 1
         self.arguments = kernel.adj.args[1:]
         self.known: list[Any] = [_UNKNOWN] * len(self.arguments)
         arrays = [k for k, a in enumerate(self.arguments) if hasattr(a.type, "ndim")]
@@ -175,11 +175,9 @@ class Command:
         fields = [(a.label, type(p)) for a, p in zip(kernel.adj.args, self.launch.params[1:], strict=True)]
         self.packed = type("Packed", (ctypes.Structure,), {"_fields_": fields})
 
-    def __call__(self, dim: int, first: int, arguments: Sequence[Any], stream: wp.Stream | None) -> None:
-        """Launches threads ``first`` to ``first + dim - 1``, with tensors, numbers, tuples or None."""
+    def __call__(self, dim: int, arguments: Sequence[Any], stream: wp.Stream) -> None:
+        """Launches ``dim`` threads on a GPU, with tensors, numbers, tuples or None."""
         self._set_dim(dim)
-        if first != self.first:
-            self.first = self.launch.params[1].value = first
         self._write(arguments)
         self.launch.launch(stream)
 
