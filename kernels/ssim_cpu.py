@@ -51,6 +51,15 @@ def _make_read_wide(channels: int):
     return vector, read_wide
 
 
+@wp.func
+def block_of(thread: int, height: int, size: int, width: int) -> wp.vec4i:
+    """First value of a line and number of values of a thread's block, and its first line and the one after its last."""
+    blocks = (size + width - 1) / width
+    begin = thread % blocks * width
+    top = thread / blocks * STRIP
+    return wp.vec4i(begin, wp.min(width, size - begin), top, wp.min(top + STRIP, height))
+
+
 @functools.cache
 def make_ssim_cpu_fwd(channels: int) -> wp.Kernel:
     """Forward kernel, one thread for each block; arguments as in ``make_ssim_fwd``, with lines of W C values."""
@@ -75,12 +84,11 @@ def make_ssim_cpu_fwd(channels: int) -> wp.Kernel:
         """The partial derivatives are not written where they are missing."""
         height = image.shape[0]
         size = image.shape[1]
-        blocks = (size + wp.static(B - 1)) / wp.static(B)
-        thread = first + wp.tid()
-        begin = thread % blocks * wp.static(B)
-        count = wp.min(wp.static(B), size - begin)
-        top = thread / blocks * STRIP
-        bottom = wp.min(top + STRIP, height)
+        block = block_of(first + wp.tid(), height, size, wp.static(B))
+        begin = block[0]
+        count = block[1]
+        top = block[2]
+        bottom = block[3]
         squares = wide()
         cross = wide()
         kept = ring()
@@ -174,12 +182,11 @@ def make_ssim_cpu_bwd(channels: int) -> wp.Kernel:
     ):
         height = d_mean.shape[0]
         size = d_mean.shape[1]
-        blocks = (size + wp.static(B - 1)) / wp.static(B)
-        thread = first + wp.tid()
-        begin = thread % blocks * wp.static(B)
-        count = wp.min(wp.static(B), size - begin)
-        top = thread / blocks * STRIP
-        bottom = wp.min(top + STRIP, height)
+        block = block_of(first + wp.tid(), height, size, wp.static(B))
+        begin = block[0]
+        count = block[1]
+        top = block[2]
+        bottom = block[3]
         v = v_sum[0]
         kept = ring()
         value = vector()
