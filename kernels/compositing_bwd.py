@@ -42,28 +42,9 @@ from .lanes import (
     stage_address,
     stage_get,
 )
-from .pixel_rows import make_read_gradient_row, make_read_row
+from .pixel_rows import make_read_gradient_row, make_read_row, read_gradient
 from .rows import GEOMETRY_PARTS, NUM_ABSOLUTE_SUMS, NUM_MOMENTS, row_load
 from .tiles import DYNAMIC
-
-
-@wp.func_native(
-    """
-    const float* values = image == 0 ? joint.data : image == 1 ? static_values.data : dynamic_values.data;
-    return values ? values[(size_t)pixel * channels + channel] : 0.0f;
-    """
-)
-def read_gradient(
-    image: int,
-    joint: wp.array[float],
-    static_values: wp.array[float],
-    dynamic_values: wp.array[float],
-    pixel: int,
-    channels: int,
-    channel: int,
-) -> float:
-    """A channel of the gradient at a pixel of an image; zero if the array of that image is missing."""
-    ...
 
 
 @functools.cache

@@ -8,6 +8,23 @@ import functools
 
 import warp as wp
 
+_OF_IMAGE = "const float* data = image == 0 ? joint.data : image == 1 ? static_values.data : dynamic_values.data;"
+"""C++ code for the gradients of an image, which has its own array, or none if they are zero."""
+
+
+@wp.func_native(f"{_OF_IMAGE} return data ? data[(size_t)pixel * channels + channel] : 0.0f;")
+def read_gradient(
+    image: int,
+    joint: wp.array[float],
+    static_values: wp.array[float],
+    dynamic_values: wp.array[float],
+    pixel: int,
+    channels: int,
+    channel: int,
+) -> float:
+    """A channel of the gradient at a pixel of an image; zero if the array of that image is missing."""
+    ...
+
 
 @functools.cache
 def make_read_row(length: int, dtype: type = float) -> tuple[type, wp.Function]:
@@ -24,12 +41,8 @@ def make_read_row(length: int, dtype: type = float) -> tuple[type, wp.Function]:
 def make_read_gradient_row(length: int) -> tuple[type, wp.Function]:
     """As ``make_read_row``, of the array of an image; the values are zero if that array is missing."""
     vector = wp.types.vector(length=length, dtype=float)
-    source = """
-        const float* data = image == 0 ? joint.data : image == 1 ? static_values.data : dynamic_values.data;
-        if (!data) count = 0;
-        """
 
-    @wp.func_native(source + _read(length, float, "data + begin"))
+    @wp.func_native(f"{_OF_IMAGE} if (!data) count = 0;" + _read(length, float, "data + begin"))
     def read_gradient_row(
         image: int,
         joint: wp.array[float],
