@@ -8,7 +8,9 @@ import torch
 from tests.reference import activation as reference
 from tests.reference.covariance import rotation
 from tests.scenes import error, generator, random_like
+from warpgs.kernels import activation as kernels
 from warpgs.ops.activation import NO_CHANGES, NUM_GEOMETRY, Changes, Raw, activate, join_sh
+from warpgs.runtime.launch import launch
 
 SIZES = [(5, 3), (0, 3), (5, 0), (0, 0), (1, 1)]
 
@@ -71,6 +73,20 @@ def test_colours_and_their_gradients_equal_the_reference(num_static, num_dynamic
     assert_same([join_sh(static, dynamic, residuals)], [expected], inputs, twins)
     assert static.sh_dc.grad is not None
     assert dynamic.sh_rest.grad is not None
+
+
+@pytest.mark.parametrize("num_residuals", [None, 1, 2])
+def test_the_kernels_of_cuda_copy_coefficients_as_the_cpu_does(num_residuals):
+    raw = random_raw(3)
+    residuals = None if num_residuals is None else random_residuals(3, num_residuals)
+    given = [t for t in leaves([raw.sh_dc, raw.sh_rest, residuals]) if t is not None]
+    expected, v_sh = join_sh(raw, random_raw(0), residuals), torch.randn(3, 4, 3, generator=generator())
+    v_expected = torch.autograd.grad(expected, given, v_sh)
+    missing, sh, v_given = [None] * (3 - len(given)), torch.zeros(3, 4, 3), [torch.zeros_like(t) for t in given]
+    launch(kernels.join_sh_fwd, sh.shape[0] * sh.shape[1], *(t.detach() for t in given), *missing, 0, sh)
+    launch(kernels.join_sh_bwd, sh.shape[0] * sh.shape[1], v_sh, 0, *v_given, *missing)
+    assert torch.equal(sh, expected)
+    assert all(torch.equal(v, wanted) for v, wanted in zip(v_given, v_expected, strict=True))
 
 
 def test_outputs_without_a_gradient_contribute_zero():
